@@ -1,0 +1,35 @@
+# Two commands on a fresh machine: `make demo` and `make test`. Both set up .venv first.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+SETUP := $(VENV)/.installed
+
+.PHONY: demo test lint bench samples clean
+
+demo: $(SETUP)
+	$(BIN)/volcli render configs/cloud.toml -o out/cloud.exr
+	$(BIN)/volcli render configs/cloud.toml -o out/cloud.png --maps transmittance
+
+test: $(SETUP) lint
+	$(BIN)/python -m pytest -n 2
+
+lint: $(SETUP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: $(SETUP)
+	$(BIN)/python -m benchmarks.render
+	$(BIN)/python -m benchmarks.load
+
+# Needs the real OpenVDB library (Debian: apt-get install python3-openvdb).
+samples:
+	/usr/bin/python3 samples/make_samples.py samples
+
+$(SETUP): pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) out build *.egg-info .pytest_cache .ruff_cache .mypy_cache
