@@ -16,7 +16,7 @@ from __future__ import annotations
 import mmap
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -130,7 +130,7 @@ class VdbFile:
             cursor = Cursor(self._data)
             self._read_file_header(cursor)
             grids = list(self._read_grids(cursor))
-        self._grids = _resolve_instances(_label(grids))
+        self._grids = _resolve_instances(_labelled(grids))
         self.headers: tuple[GridHeader, ...] = tuple(grid.header for grid in self._grids)
 
     def read_tree(self, header: GridHeader, progress: Progress | None = None) -> Tree:
@@ -239,8 +239,8 @@ class VdbFile:
             map_type=map_type,
             world_from_index=world_from_index,
             background=background,
-            active_voxels=_declared_count(metadata),
-            active_box=_declared_box(metadata),
+            active_voxels=declared_count(metadata),
+            active_box=declared_box(metadata),
             stored=_describe_storage(compression, half),
             metadata=metadata,
             refusal=type_refusal or refusal,
@@ -330,14 +330,16 @@ def _value_type(type_name: str) -> tuple[str, ValueType | None, str | None]:
     return name, VALUE_TYPES[name], None
 
 
-def _declared_count(metadata: Mapping[str, Any]) -> int | None:
+def declared_count(metadata: Mapping[str, Any]) -> int | None:
+    """The number of active voxels that a grid's metadata declare, true or not."""
     count = metadata.get("file_voxel_count")
     return count if isinstance(count, int) and count >= 0 else None
 
 
-def _declared_box(
+def declared_box(
     metadata: Mapping[str, Any],
 ) -> tuple[tuple[int, int, int], tuple[int, int, int]] | None:
+    """The box of active voxels that a grid's metadata declare, true or not."""
     low, high = metadata.get("file_bbox_min"), metadata.get("file_bbox_max")
     if not (isinstance(low, tuple) and isinstance(high, tuple) and len(low) == len(high) == 3):
         return None
@@ -370,20 +372,27 @@ def _end_of_stream(grid: _Grid, behind: int) -> _Grid:
     return replace(grid, header=replace(grid.header, refusal=lost))
 
 
-def _label(grids: list[_Grid]) -> list[_Grid]:
+def unique_labels(names: Sequence[str]) -> list[str]:
     """Label grids: a unique name as it is, others with their number among those of one name."""
-    count = Counter(grid.header.name for grid in grids)
-    taken = {name for name, uses in count.items() if name and uses == 1}
+    taken = {name for name, uses in Counter(names).items() if name and uses == 1}
     number: Counter[str] = Counter()
-    labelled = []
-    for grid in grids:
-        label = name = grid.header.name
-        if label not in taken:
+    labels = []
+    for name in names:
+        label = name
+        if name not in taken:
             while (label := f"{name}[{number[name]}]") in taken:
                 number[name] += 1
             number[name] += 1
-        labelled.append(replace(grid, header=replace(grid.header, label=label)))
-    return labelled
+        labels.append(label)
+    return labels
+
+
+def _labelled(grids: list[_Grid]) -> list[_Grid]:
+    labels = unique_labels([grid.header.name for grid in grids])
+    return [
+        replace(grid, header=replace(grid.header, label=label))
+        for grid, label in zip(grids, labels, strict=True)
+    ]
 
 
 def _resolve_instances(grids: list[_Grid]) -> list[_Grid]:
