@@ -1,0 +1,211 @@
+"""Volume files in, `BrickGrid`s out: opening a file by its kind, and choosing and reading a grid.
+
+open_volume(path)          a `Volume`: headers are read, voxels are not
+density_grid, color_grid   which grid a job means
+load(volume, header)       that grid as bricks
+"""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+
+from volcli.errors import VolumeError
+from volcli.grids.brick import BrickGrid, build
+from volcli.grids.tree import GridHeader, Progress, Tree, Volume
+from volcli.grids.values import clamp_negative, settle_nonfinite
+
+__all__ = [
+    "BrickGrid",
+    "GridHeader",
+    "Progress",
+    "Tree",
+    "Volume",
+    "color_grid",
+    "density_grid",
+    "load_color",
+    "load_density",
+    "open_volume",
+]
+
+DENSITY = "density"
+"""The name by which a file says which of its grids is the density."""
+
+
+def open_volume(path: Path, reader: str = "volcli") -> Volume:
+    """Open a volume file: header and metadata only.
+
+    Parameters
+    ----------
+    path
+        ``.vdb``, ``.npy`` or ``.npz``; a file with another ending is looked into.
+    reader
+        ``volcli`` or ``openvdb``; of use for ``.vdb`` alone.
+
+    Raises
+    ------
+    VolumeError
+        If there is no such file, or it is no volume.
+    """
+    if path.is_dir():
+        raise VolumeError(f"{path}: is a folder; give a volume file (.vdb, .npy or .npz)")
+    try:
+        with path.open("rb") as file:
+            start = file.read(8)
+    except FileNotFoundError as error:
+        raise VolumeError(f"{path}: no such file{_nearby(path)}") from error
+    except OSError as error:
+        raise VolumeError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if path.suffix.lower() in (".npy", ".npz"):
+        from volcli.grids.dense import open_dense
+
+        return open_dense(path)
+    if start.startswith(b"NanoVDB"):
+        raise VolumeError(
+            f"{path}: is a NanoVDB file; volcli reads OpenVDB: convert it with nanovdb_convert"
+        )
+    if path.suffix.lower() != ".vdb" and not start.startswith(b" BDV"):
+        raise VolumeError(f"{path}: is not a volume; volcli reads .vdb, .npy and .npz")
+    if reader == "openvdb":
+        from volcli.grids.pyopenvdb import open_openvdb
+
+        return open_openvdb(path)
+    from volcli.grids.vdb import open_vdb
+
+    return open_vdb(path)
+
+
+def density_grid(volume: Volume, name: str | None) -> tuple[GridHeader, list[str]]:
+    """The grid that is the density, and what the user should know of the choice.
+
+    Without a name it is the grid named ``density``, else the only scalar grid there is.
+
+    Raises
+    ------
+    VolumeError
+        If there is no such grid, the choice is not clear, or the grid cannot be a density.
+    """
+    notes: list[str] = []
+    if name is not None or any(h.name == DENSITY for h in volume.headers):
+        header = _named(volume, name or DENSITY, "scalar", notes)
+    else:
+        scalars = [h for h in volume.headers if not h.is_vector and h.refusal is None]
+        if len(scalars) != 1:
+            raise VolumeError(
+                f"{volume.path}: no grid named 'density', and "
+                + (f"{len(scalars)} scalar grids" if scalars else "no scalar grid that can be read")
+                + f"; it has: {_listed(volume)}"
+                + ("; choose one with --grid" if scalars else "")
+            )
+        header = scalars[0]
+        notes.append(f"{volume.path.name}: no grid named 'density'; rendering '{header.label}'")
+    _must_read(volume, header)
+    if header.is_vector:
+        raise VolumeError(
+            f"{volume.path}: grid '{header.label}' is {header.value_type}; a density is a scalar. "
+            f"It has: {_listed(volume)}"
+        )
+    if header.grid_class == "level set":
+        raise VolumeError(
+            f"{volume.path}: grid '{header.label}' is a level set (distances to a surface), not "
+            f"fog; convert it with OpenVDB's sdfToFogVolume or Houdini's Convert VDB, or choose "
+            f"another with --grid (it has: {_listed(volume)})"
+        )
+    return header, notes
+
+
+def color_grid(volume: Volume, name: str) -> tuple[GridHeader, list[str]]:
+    """The grid that is the colour, and what the user should know of the choice.
+
+    Raises
+    ------
+    VolumeError
+        If there is no such grid, or it is not a grid of three components.
+    """
+    notes: list[str] = []
+    header = _named(volume, name, "vec3", notes)
+    _must_read(volume, header)
+    if not header.is_vector:
+        raise VolumeError(
+            f"{volume.path}: grid '{header.label}' is {header.value_type}; a colour grid is vec3. "
+            f"It has: {_listed(volume)}"
+        )
+    return header, notes
+
+
+def load_density(
+    volume: Volume, header: GridHeader, nonfinite: str, progress: Progress | None = None
+) -> tuple[BrickGrid, list[str]]:
+    """Read a grid as a density (values below 0 become 0), with warnings on what was changed.
+
+    Raises
+    ------
+    VolumeError
+        If the file is damaged, or holds NaN or Inf and ``nonfinite`` is ``error``.
+    """
+    where = f"{volume.path}: grid '{header.label}'"
+    tree, notes = settle_nonfinite(volume.read_tree(header, progress), where, nonfinite)
+    tree, clamped = clamp_negative(tree, where)
+    grid = build(tree, header)
+    if grid.is_empty:
+        clamped.append(f"{where}: is empty; there is nothing to see but the background")
+    elif float(grid.background) > 0:
+        clamped.append(
+            f"{where}: is {float(grid.background):g} outside its voxels; cut at its active box"
+        )
+    return grid, notes + clamped
+
+
+def load_color(
+    volume: Volume, header: GridHeader, nonfinite: str, progress: Progress | None = None
+) -> tuple[BrickGrid, list[str]]:
+    """Read a grid as a colour. Values below 0 are kept; the model is linear in them.
+
+    Raises
+    ------
+    VolumeError
+        If the file is damaged, or holds NaN or Inf and ``nonfinite`` is ``error``.
+    """
+    where = f"{volume.path}: grid '{header.label}'"
+    tree, notes = settle_nonfinite(volume.read_tree(header, progress), where, nonfinite)
+    return build(tree, header), notes
+
+
+def _named(volume: Volume, name: str, kind: str, notes: list[str]) -> GridHeader:
+    """The grid of that label; of several grids of one name the first, with a note."""
+    for header in volume.headers:
+        if header.label == name:
+            return header
+    same = [h for h in volume.headers if h.name == name]
+    if same:
+        others = ", ".join(h.label for h in same[1:])
+        notes.append(
+            f"{volume.path.name}: {len(same)} grids are named '{name}'; taking '{same[0].label}' "
+            f"(there is also {others})"
+        )
+        return same[0]
+    close = difflib.get_close_matches(name, [h.label for h in volume.headers], n=1, cutoff=0.5)
+    meant = f"; did you mean '{close[0]}'?" if close else ""
+    raise VolumeError(f"{volume.path}: no {kind} grid '{name}'; it has: {_listed(volume)}{meant}")
+
+
+def _must_read(volume: Volume, header: GridHeader) -> None:
+    if header.refusal is not None:
+        raise VolumeError(
+            f"{volume.path}: grid '{header.label}' cannot be rendered: {header.refusal}; "
+            f"it has: {_listed(volume)}"
+        )
+
+
+def _listed(volume: Volume) -> str:
+    return ", ".join(f"{h.label} ({h.value_type})" for h in volume.headers) or "no grids"
+
+
+def _nearby(path: Path) -> str:
+    """A hint at a file of a similar name in the same folder."""
+    try:
+        names = [p.name for p in path.parent.iterdir() if p.is_file()]
+    except OSError:
+        return ""
+    close = difflib.get_close_matches(path.name, names, n=1, cutoff=0.7)
+    return f"; did you mean {path.parent / close[0]}?" if close else ""

@@ -4,14 +4,17 @@
     _openvdb_worker.py tree FILE OUT NAME               writes OUT/<array>.npy
 
 What fails is written to OUT/error.txt, in one line, and ends the process with 3. This file imports
-nothing of volcli and runs on any Python that OpenVDB's module is built for; `pyopenvdb` starts it.
+nothing of volcli; `pyopenvdb` starts it.
 """
+
+from __future__ import annotations
 
 import itertools
 import json
 import operator
 import os
 import sys
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +22,10 @@ try:
     import openvdb
 except ImportError:
     import pyopenvdb as openvdb
+
+Array = np.ndarray[Any, Any]
+Point = tuple[int, ...]
+Tile = tuple[Point, int, Any, bool]  # origin, width, value, active
 
 FAILED = 3
 ROOT, UPPER, LOWER, LEAF = 4096, 128, 8, 1  # width of what the root, a node and a leaf hold
@@ -37,7 +44,7 @@ DTYPES = {
 }
 
 
-def grid_headers(path, names):
+def grid_headers(path: str, names: list[str] | None) -> list[dict[str, Any]]:
     """Headers of all grids at once, or of those named: a grid of unknown type then costs itself."""
     if names is None:
         return [header(grid) for grid in openvdb.readAllGridMetadata(path)]
@@ -50,7 +57,7 @@ def grid_headers(path, names):
     return found
 
 
-def header(grid):
+def header(grid: Any) -> dict[str, Any]:
     transform = grid.transform
     linear = bool(getattr(transform, "isLinear", True))
     corner = transform.indexToWorld((0.0, 0.0, 0.0))
@@ -69,7 +76,7 @@ def header(grid):
     }
 
 
-def write_tree(path, out, name):
+def write_tree(path: str, out: str, name: str) -> None:
     grid = openvdb.read(path, name)
     if grid.valueTypeName not in DTYPES:
         raise TypeError(f"values of type {grid.valueTypeName} cannot be copied")
@@ -91,15 +98,16 @@ def write_tree(path, out, name):
         np.save(os.path.join(out, key + ".npy"), array)  # noqa: PTH118
 
 
-def descend(grid):
+def descend(grid: Any) -> tuple[list[list[Point]], list[Tile]]:
     """Find the leaves, by 16^3 node, and the tiles, asking at which depth single points lie."""
     accessor = grid.getConstAccessor()
     background = grid.background
-    nodes, tiles = [], []
+    nodes: list[list[Point]] = []
+    tiles: list[Tile] = []
 
-    def visit(origin, width, depth):
+    def visit(origin: Point, width: int, depth: int) -> list[Point]:
         """Return the children, ``width`` wide, of the node at ``origin``; note its tiles."""
-        children = []
+        children: list[Point] = []
         steps = [range(x, x + width * (32 if depth == 1 else 16), width) for x in origin]
         for point in itertools.product(*steps):
             if accessor.getValueDepth(point) > depth:
@@ -108,7 +116,7 @@ def descend(grid):
                 note_tile(point, width)
         return children
 
-    def note_tile(point, width):
+    def note_tile(point: Point, width: int) -> None:
         value, active = accessor.probeValue(point)
         if active or (value != background and value == value):
             tiles.append((point, width, value, active))
@@ -125,7 +133,7 @@ def descend(grid):
     return nodes, tiles
 
 
-def root_cells(grid):
+def root_cells(grid: Any) -> list[Point]:
     """Where children and tiles of the root can be: the box of all leaves and active values.
 
     Where that box is vast (two far corners) the active values are listed instead: slow, and leaves
@@ -143,7 +151,7 @@ def root_cells(grid):
     return sorted({tuple(x & -ROOT for x in value.min) for value in grid.citerOnValues()})
 
 
-def leaf_values(grid, nodes, dtype, shape):
+def leaf_values(grid: Any, nodes: list[list[Point]], dtype: Any, shape: Any) -> Array:
     """Copy leaves out, (n, 8, 8, 8, ...): one dense copy of their box for each 16^3 node."""
     values = np.empty((sum(map(len, nodes)), 8, 8, 8, *shape), dtype)
     done = 0
@@ -164,7 +172,7 @@ def leaf_values(grid, nodes, dtype, shape):
     return values
 
 
-def copy_voxels(grid, leaves, out):
+def copy_voxels(grid: Any, leaves: list[Point], out: Array) -> None:
     """Copy leaves voxel by voxel, where copyToArray cannot be trusted: slow, and rare."""
     value_at = grid.getConstAccessor().getValue
     for leaf, values in zip(leaves, out, strict=True):
@@ -172,7 +180,7 @@ def copy_voxels(grid, leaves, out):
             values[xyz] = value_at(tuple(a + b for a, b in zip(leaf, xyz, strict=True)))
 
 
-def leaf_masks(grid, nodes, values):
+def leaf_masks(grid: Any, nodes: list[list[Point]], values: Array) -> Array:
     """The active voxels: those that change when all active values of a copy are replaced.
 
     The library has no cheaper way to ask. Where values are bool each is negated; else each becomes
@@ -192,16 +200,16 @@ def leaf_masks(grid, nodes, values):
     return np.packbits(active, axis=1, bitorder="little")
 
 
-def one_line(error):
+def one_line(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def as_json(value):
+def as_json(value: Any) -> Any:
     """What JSON cannot hold of a metadatum: its text."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-def main(task, path, out, *rest):
+def main(task: str, path: str, out: str, *rest: str) -> int:
     openvdb.setLoggingLevel("fatal")
     try:
         if task == "tree":

@@ -223,5 +223,5 @@ def _environment() -> dict[str, str]:
     return {
         key: value
         for key, value in os.environ.items()
-        if not key.startswith("PYTHON") and key not in ("VIRTUAL_ENV", "__PYVENV_LAUNCHER__")
+        if not key.startswith(("PYTHON", "VIRTUAL_ENV", "__PYVENV_LAUNCHER__"))
     }

@@ -107,8 +107,15 @@ class Tree:
 class Volume(Protocol):
     """An opened file: its headers are read, its voxels are not."""
 
-    path: Path
-    headers: tuple[GridHeader, ...]
+    @property
+    def path(self) -> Path:
+        """The file."""
+        ...
+
+    @property
+    def headers(self) -> tuple[GridHeader, ...]:
+        """One for each grid, in the order of the file."""
+        ...
 
     def read_tree(self, header: GridHeader, progress: Progress | None = None) -> Tree:
         """Read the voxels of one grid.

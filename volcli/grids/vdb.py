@@ -310,9 +310,16 @@ def _read_transform(
             matrix[:3, 3], numbers = numbers[:3], numbers[3:]
         if "Scale" in map_type:
             matrix[[0, 1, 2], [0, 1, 2]] = numbers[:3]
-    if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix[:3, :3], tol=0) < 3:
-        return map_type, matrix, "transform without an inverse"
-    return map_type, matrix, None
+    return map_type, matrix, None if _has_inverse(matrix) else "transform without an inverse"
+
+
+def _has_inverse(matrix: NDArray[np.float64]) -> bool:
+    try:
+        with np.errstate(all="ignore"):
+            inverse = np.linalg.inv(matrix)
+    except np.linalg.LinAlgError:
+        return False
+    return bool(np.isfinite(matrix).all() and np.isfinite(inverse).all())
 
 
 def _value_type(type_name: str) -> tuple[str, ValueType | None, str | None]:

@@ -1,0 +1,421 @@
+"""`BrickGrid`: the sparse form of a grid that the kernels walk, built straight from a `Tree`.
+
+The field of a grid is trilinear between lattice points, so the unit of work is a **cell**: the cube
+between eight lattice points. A **brick** is 8x8x8 cells with all 9x9x9 values at their corners, so
+that a cell never needs a neighbour's data. A leaf's values reach one voxel further than the leaf:
+the cells just below it, its *skirt*, blend from the outside to the leaf's first layer, and lie in
+the bricks below. Leaving them out is the classic error.
+
+Three levels of tables lead to a brick, as in the file: cells of 4096 voxels at the root, 32^3
+blocks of 128 voxels in each, 16^3 bricks in each of those. An entry is a child (>= 0) or a constant
+(``-1 - k``, the value ``constants[k]``); constant 0 is the background. A region that is constant
+is one entry at the highest level that can hold it, so a tile is never voxelised inside.
+
+How the apron is found at each level: a node's cells read from itself and from its seven neighbours
+on the + side. Its **signature** is those eight source entries. Where all are one constant, so is
+the node; where all are constants but not the same, all nodes with that signature are one shared
+node (so the surface of a 4096-voxel tile is a handful of nodes); else the node is refined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from volcli.grids.tree import GridHeader, Tree
+
+BRICK = 8
+APRON = BRICK + 1
+LOWER = 16
+UPPER = 32
+ROOT_WIDTH = BRICK * LOWER * UPPER
+
+CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+"""The eight corners of a cell; a signature lists its entries in this order."""
+
+BACKGROUND = -1
+"""The entry of the constant 0."""
+
+_CHUNK = 64
+"""Nodes refined at a time: bounds the memory of the work to some tens of MB."""
+
+
+class BrickArrays(NamedTuple):
+    """The arrays of a `BrickGrid` as the kernels take them; local voxels count from ``origin``.
+
+    Attributes
+    ----------
+    atlas
+        (n, 729) or (n, 729, 3) float32: the values of each brick, index ``(x*9 + y)*9 + z``.
+    constants
+        (k,) or (k, 3) float32.
+    lower
+        (l, 4096) int32: entries of bricks, index ``(x*16 + y)*16 + z``.
+    occupied
+        (l, 64) bool: which of the 4^3 macro cells (4^3 bricks each) of a lower node hold anything
+        but background; index ``(x*4 + y)*4 + z``.
+    upper
+        (u, 32768) int32: entries of lower nodes, index ``(x*32 + y)*32 + z``.
+    root_keys, root_entries
+        (r,) int64 sorted, (r,) int32: the root cells that are not background; a key is
+        ``(i*ny + j)*nz + k`` over the intervals between the planes.
+    planes_x, planes_y, planes_z
+        float64: where root cells begin and end, in local voxels. Gaps between far parts of a
+        volume are one interval each, whatever their width.
+    """
+
+    atlas: NDArray[np.float32]
+    constants: NDArray[np.float32]
+    lower: NDArray[np.int32]
+    occupied: NDArray[np.bool_]
+    upper: NDArray[np.int32]
+    root_keys: NDArray[np.int64]
+    root_entries: NDArray[np.int32]
+    planes_x: NDArray[np.float64]
+    planes_y: NDArray[np.float64]
+    planes_z: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class BrickGrid:
+    """A grid, ready to be walked.
+
+    Attributes
+    ----------
+    arrays
+        What the kernels take.
+    origin
+        (3,) int64, index space: the lattice point that local voxels count from.
+    world_from_index
+        (4, 4) float64.
+    active_box
+        (2, 3) int64, index space: the smallest and largest lattice point that is active or differs
+        from the background; ``lo > hi`` when there is none.
+    brick_min, brick_max
+        (n,) or (n, 3) float32: the range of the values of each brick, apron included.
+    """
+
+    arrays: BrickArrays
+    origin: NDArray[np.int64]
+    world_from_index: NDArray[np.float64]
+    active_box: NDArray[np.int64]
+    brick_min: NDArray[np.float32]
+    brick_max: NDArray[np.float32]
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing differs from the background."""
+        return bool((self.active_box[0] > self.active_box[1]).any())
+
+    @property
+    def background(self) -> NDArray[np.float32]:
+        """() or (3,): the value outside all that is stored."""
+        return self.arrays.constants[0]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held."""
+        return sum(a.nbytes for a in (*self.arrays, self.brick_min, self.brick_max))
+
+    @property
+    def local_from_world(self) -> NDArray[np.float64]:
+        """(3, 4): from world units to local voxels."""
+        m: NDArray[np.float64] = np.linalg.inv(self.world_from_index)[:3]
+        m[:, 3] -= self.origin
+        return m
+
+    def support(self, interpolation: str) -> NDArray[np.float64]:
+        """(2, 3): the box, in local voxels, beyond which the field is the background.
+
+        A lattice point reaches one voxel to each side when values are blended (``linear``), half a
+        voxel when they are not (``nearest``).
+        """
+        reach = 1.0 if interpolation == "linear" else 0.5
+        box = (self.active_box - self.origin).astype(np.float64)
+        return box + np.array([[-reach], [reach]])
+
+    def world_box(self) -> NDArray[np.float64]:
+        """(2, 3): the axis-aligned box in world units around the active lattice points."""
+        return to_world(self.active_box, self.world_from_index)
+
+
+def to_world(box: NDArray[Any], world_from_index: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(2, 3): the axis-aligned box in world units around a box (2, 3) of index space."""
+    corners = np.where(CORNERS, box[1], box[0]).astype(np.float64)
+    world = corners @ world_from_index[:3, :3].T + world_from_index[:3, 3]
+    return np.array([world.min(axis=0), world.max(axis=0)])
+
+
+def build(tree: Tree, header: GridHeader) -> BrickGrid:
+    """Build the bricks of a tree.
+
+    Parameters
+    ----------
+    tree
+        Leaves and tiles of any value type; values become float32.
+    header
+        Gives the transform.
+    """
+    assert header.world_from_index is not None, "readers refuse grids without a linear transform"
+    values = tree.leaf_values.astype(np.float32, copy=False)
+    constants, tile_entries = _constants(tree)
+    active_box = _active_box(tree)
+
+    source = _SourceTables(tree, tile_entries)
+    roots, root_signatures = source.root_signatures()
+    root_entries, upper_signatures = _entries(root_signatures)
+    upper, lower_signatures = _refine(upper_signatures, source.upper, UPPER)
+    lower, brick_signatures = _refine(
+        lower_signatures, source.lower, LOWER, drop=_background_parts(values, constants[0])
+    )
+    atlas = _fill(brick_signatures, values, constants)
+
+    keep = root_entries != BACKGROUND
+    first = (active_box[0] - 1) // ROOT_WIDTH
+    planes, keys = _root_index(roots[keep] - first, active_box[1] // ROOT_WIDTH - first)
+    order = np.argsort(keys)
+    return BrickGrid(
+        arrays=BrickArrays(
+            atlas,
+            constants,
+            lower,
+            _occupied(lower),
+            upper,
+            keys[order],
+            root_entries[keep][order],
+            *planes,
+        ),
+        origin=first * ROOT_WIDTH,
+        world_from_index=np.asarray(header.world_from_index, np.float64),
+        active_box=active_box,
+        brick_min=atlas.min(axis=1) if len(atlas) else atlas[:, 0],
+        brick_max=atlas.max(axis=1) if len(atlas) else atlas[:, 0],
+    )
+
+
+def _constants(tree: Tree) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """The distinct constants, the background first, and the entry of each tile."""
+    background = np.asarray(tree.background, np.float32)[None]
+    every = np.concatenate(
+        [background, tree.tile_values.astype(np.float32).reshape(-1, *background.shape[1:])]
+    )
+    unique, which = np.unique(every, axis=0, return_inverse=True)
+    which = which.reshape(-1)
+    rank = np.empty(len(unique), np.int32)  # the background becomes constant 0
+    rest = np.delete(np.arange(len(unique)), which[0])
+    order = np.concatenate([which[:1], rest])
+    rank[order] = np.arange(len(unique), dtype=np.int32)
+    return np.ascontiguousarray(unique[order]), (-1 - rank[which[1:]]).astype(np.int32)
+
+
+def _active_box(tree: Tree) -> NDArray[np.int64]:
+    """Smallest and largest lattice point that is active or differs from the background."""
+    vector = tree.leaf_values.ndim == 5
+    boxes = []
+    if len(tree.leaf_origins):
+        differs = tree.leaf_values != tree.background
+        if vector:
+            differs = differs.any(axis=-1)
+        active = np.unpackbits(tree.leaf_masks, axis=1, bitorder="little").astype(bool)
+        used = differs | active.reshape(differs.shape)
+        origins = tree.leaf_origins.astype(np.int64)
+        for axis in range(3):
+            others = tuple(a for a in (1, 2, 3) if a != axis + 1)
+            lines = used.any(axis=others)  # (n, 8)
+            leaf, at = np.nonzero(lines)
+            where = origins[leaf, axis] + at
+            boxes.append((where.min(), where.max()) if len(where) else (1, 0))
+        leaves = np.array(boxes, np.int64).T
+    else:
+        leaves = np.array([[1, 1, 1], [0, 0, 0]], np.int64)
+    if not len(tree.tile_origins):
+        return leaves
+    lo = tree.tile_origins.astype(np.int64)
+    hi = lo + tree.tile_widths.astype(np.int64)[:, None] - 1
+    tiles = np.array([lo.min(axis=0), hi.max(axis=0)])
+    if (leaves[0] > leaves[1]).any():
+        return tiles
+    return np.array([np.minimum(leaves[0], tiles[0]), np.maximum(leaves[1], tiles[1])])
+
+
+class _SourceTables:
+    """The tree as tables of entries, one a level: what a signature's entries point into."""
+
+    def __init__(self, tree: Tree, tile_entries: NDArray[np.int32]) -> None:
+        origins = np.concatenate([tree.leaf_origins, tree.tile_origins]).astype(np.int64)
+        leaves = np.arange(len(tree.leaf_origins), dtype=np.int32)
+        entries = np.concatenate([leaves, tile_entries])
+        widths = np.concatenate([np.full(len(leaves), BRICK), tree.tile_widths])
+        in_root, in_block, at_brick = widths == ROOT_WIDTH, widths == 128, widths == BRICK
+
+        roots = origins // ROOT_WIDTH
+        self.roots, root_of = np.unique(roots, axis=0, return_inverse=True)
+        root_of = root_of.reshape(-1)
+        self.root_entries = np.full(len(self.roots), BACKGROUND, np.int32)
+        self.root_entries[root_of[in_root]] = entries[in_root]
+        with_upper = np.unique(root_of[~in_root])
+        self.root_entries[with_upper] = np.arange(len(with_upper))
+
+        block = _flat(origins // 128 % UPPER, UPPER)
+        upper_of = self.root_entries[root_of]
+        self.upper = np.full((len(with_upper), UPPER**3), BACKGROUND, np.int32)
+        self.upper[upper_of[in_block], block[in_block]] = entries[in_block]
+
+        node_key = upper_of.astype(np.int64) * UPPER**3 + block
+        nodes, lower_of = np.unique(node_key[at_brick], return_inverse=True)
+        self.upper.reshape(-1)[nodes] = np.arange(len(nodes))
+        self.lower = np.full((len(nodes), LOWER**3), BACKGROUND, np.int32)
+        brick = _flat(origins // BRICK % LOWER, LOWER)
+        self.lower[lower_of.reshape(-1), brick[at_brick]] = entries[at_brick]
+
+    def root_signatures(self) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """The root cells whose field may differ from the background, and their signatures."""
+        reached = (self.roots[:, None] - CORNERS).reshape(-1, 3)
+        cells = np.unique(reached, axis=0) if len(reached) else reached
+        known = {tuple(r): e for r, e in zip(self.roots.tolist(), self.root_entries, strict=True)}
+        signatures = [
+            [known.get(tuple(n), BACKGROUND) for n in (cell + CORNERS).tolist()] for cell in cells
+        ]
+        return cells, np.array(signatures, np.int32).reshape(-1, 8)
+
+
+def _flat(coordinates: NDArray[np.int64], width: int) -> NDArray[np.int64]:
+    return (coordinates[:, 0] * width + coordinates[:, 1]) * width + coordinates[:, 2]
+
+
+def _entries(
+    signatures: NDArray[np.int32], first: int = 0
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """An entry for each signature (..., 8), and the signatures (m, 8) that become children.
+
+    Children are numbered from ``first``.
+    """
+    shape = signatures.shape[:-1]
+    flat = signatures.reshape(-1, 8)
+    entries = flat[:, 0].copy()
+    uniform = (flat[:, 0] < 0) & (flat == flat[:, :1]).all(axis=1)
+    rest = np.flatnonzero(~uniform)
+    rows = flat[rest]
+    all_constant = (rows < 0).all(axis=1)
+    shared, which = np.unique(rows[all_constant], axis=0, return_inverse=True)
+    own = rows[~all_constant]
+    entries[rest[all_constant]] = first + which.reshape(-1)
+    entries[rest[~all_constant]] = first + len(shared) + np.arange(len(own))
+    return entries.reshape(shape), np.concatenate([shared, own])
+
+
+def _refine(
+    signatures: NDArray[np.int32],
+    tables: NDArray[np.int32],
+    width: int,
+    drop: NDArray[np.bool_] | None = None,
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """One level down: the table of each node (m, width^3), and the signatures of their children.
+
+    Parameters
+    ----------
+    signatures
+        (m, 8): the nodes, by the entries of their source and its + neighbours.
+    tables
+        (k, width^3): the source tables that those entries point into.
+    drop
+        (n, 8): for each source child and corner, whether the part of it that a node's corner reads
+        is all background, so that it counts as that constant.
+    """
+    nodes, children, first = [np.empty((0, width**3), np.int32)], [], 0
+    cubes = tables.reshape(-1, width, width, width)
+    for chunk in _chunks(signatures):
+        extended = _extended(chunk, cubes, width)
+        fine = np.stack(
+            [extended[:, x : x + width, y : y + width, z : z + width] for x, y, z in CORNERS],
+            axis=-1,
+        )
+        if drop is not None and len(drop):
+            fine[(fine >= 0) & drop[fine, np.arange(8)]] = BACKGROUND
+        entries, below = _entries(fine, first)
+        nodes.append(entries.reshape(len(chunk), -1))
+        children.append(below)
+        first += len(below)
+    return np.concatenate(nodes), np.concatenate([np.empty((0, 8), np.int32), *children])
+
+
+def _extended(
+    signatures: NDArray[np.int32], cubes: NDArray[np.int32], width: int
+) -> NDArray[np.int32]:
+    """(m, width+1, ...): each node's source entries with one layer of its + neighbours'."""
+    extended = np.empty((len(signatures), width + 1, width + 1, width + 1), np.int32)
+    for corner, (x, y, z) in enumerate(CORNERS):
+        region = extended[:, _part(x, width), _part(y, width), _part(z, width)]
+        entry = signatures[:, corner]
+        region[...] = entry[:, None, None, None]
+        child = entry >= 0
+        region[child] = cubes[entry[child]][:, _read(x), _read(y), _read(z)]
+    return extended
+
+
+def _part(side: int, width: int) -> slice:
+    """Where along an axis the entries of the node itself (0) or of its + neighbour (1) go."""
+    return slice(width, width + 1) if side else slice(0, width)
+
+
+def _read(side: int) -> slice:
+    """What along an axis is read of the node itself (0): all; of its + neighbour (1): a layer."""
+    return slice(0, 1) if side else slice(None)
+
+
+def _chunks(rows: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    for start in range(0, len(rows), _CHUNK):
+        yield rows[start : start + _CHUNK]
+
+
+def _background_parts(
+    values: NDArray[np.float32], background: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """(n, 8): whether the part of each leaf that a brick's corner reads is all background."""
+    same = values == background
+    if values.ndim == 5:
+        same = same.all(axis=-1)
+    parts = [same[:, _read(x), _read(y), _read(z)].all(axis=(1, 2, 3)) for x, y, z in CORNERS]
+    return np.stack(parts, axis=-1)
+
+
+def _fill(
+    signatures: NDArray[np.int32], values: NDArray[np.float32], constants: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """The atlas: for each brick, its leaf's values and the apron out of its + neighbours'."""
+    channels = values.shape[4:]
+    atlas = np.empty((len(signatures), APRON, APRON, APRON, *channels), np.float32)
+    chunk = 16 * _CHUNK
+    for start in range(0, len(signatures), chunk):
+        rows, bricks = signatures[start : start + chunk], atlas[start : start + chunk]
+        for corner, (x, y, z) in enumerate(CORNERS):
+            region = bricks[:, _part(x, BRICK), _part(y, BRICK), _part(z, BRICK)]
+            entry = rows[:, corner]
+            leaf = entry >= 0
+            region[leaf] = values[entry[leaf]][:, _read(x), _read(y), _read(z)]
+            region[~leaf] = constants[-1 - entry[~leaf]].reshape(-1, 1, 1, 1, *channels)
+    return atlas.reshape(-1, APRON**3, *channels)
+
+
+def _occupied(lower: NDArray[np.int32]) -> NDArray[np.bool_]:
+    cells = (lower != BACKGROUND).reshape(-1, 4, 4, 4, 4, 4, 4)
+    return np.ascontiguousarray(cells.any(axis=(2, 4, 6)).reshape(-1, 64))
+
+
+def _root_index(
+    cells: NDArray[np.int64], last: NDArray[np.int64]
+) -> tuple[list[NDArray[np.float64]], NDArray[np.int64]]:
+    """Planes along each axis, in local voxels, and the key of each root cell among them.
+
+    The planes reach from 0 to the end of the cell ``last``, so that they hold all of the support.
+    """
+    ends = [[0, max(int(last[a]), 0) + 1] for a in range(3)]
+    edges = [np.unique(np.concatenate([cells[:, a], cells[:, a] + 1, ends[a]])) for a in range(3)]
+    at = [np.searchsorted(edges[a], cells[:, a]) for a in range(3)]
+    counts = [len(e) - 1 for e in edges]
+    keys = (at[0] * counts[1] + at[1]) * counts[2] + at[2]
+    return [e * float(ROOT_WIDTH) for e in edges], keys.astype(np.int64)

@@ -1,0 +1,178 @@
+"""Dense grids: ``.npy`` and ``.npz`` files as volumes.
+
+A ``.npy`` file is one grid of voxel size 1 at the origin. A ``.npz`` file holds named grids, and
+optionally ``voxel_size`` (one number or three) and ``origin`` (three numbers: the world position of
+the first lattice point), which hold for all of them. Arrays are indexed [x, y, z] or, for colour,
+[x, y, z, channel]. Outside an array a grid is 0. Pickled objects are never read.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from volcli.errors import VolumeError
+from volcli.grids.tree import LEAF_WIDTH, GridHeader, Progress, Tree
+
+_PLACEMENT = ("voxel_size", "origin")
+_MAX_HEADER = 1 << 16
+
+
+@dataclass(frozen=True)
+class DenseVolume:
+    """An opened ``.npy`` or ``.npz`` file; see `volcli.grids.tree.Volume`."""
+
+    path: Path
+    headers: tuple[GridHeader, ...]
+
+    def read_tree(self, header: GridHeader, progress: Progress | None = None) -> Tree:
+        """Read one array and cut it into leaves; leaves of zeros alone are left out."""
+        if header.refusal:
+            raise VolumeError(f"{self.path}: grid '{header.label}': {header.refusal}")
+        return tree_from_array(_load(self.path, header.name))
+
+
+def open_dense(path: Path) -> DenseVolume:
+    """Open a ``.npy`` or ``.npz`` file; reads shapes and types, not the values.
+
+    Raises
+    ------
+    VolumeError
+        If the file is damaged, holds no array, or its voxel size or origin make no sense.
+    """
+    try:
+        if path.suffix == ".npy":
+            with path.open("rb") as file:
+                shapes = {"density": _array_header(file)}
+            world = np.eye(4)
+        else:
+            with zipfile.ZipFile(path) as archive:
+                names = [n.removesuffix(".npy") for n in archive.namelist() if n.endswith(".npy")]
+                shapes = {}
+                for name in names:
+                    if name not in _PLACEMENT:
+                        with archive.open(name + ".npy") as file:
+                            shapes[name] = _array_header(file)
+                placed = {name: _load(path, name) for name in _PLACEMENT if name in names}
+            world = _placement(path, placed)
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise VolumeError(f"{path}: not a readable NumPy file: {error}") from error
+    if not shapes:
+        raise VolumeError(f"{path}: holds no array")
+    return DenseVolume(path, tuple(_header(n, s, d, world) for n, (s, d) in shapes.items()))
+
+
+def tree_from_array(values: NDArray[Any]) -> Tree:
+    """Cut an array (nx, ny, nz) or (nx, ny, nz, 3) into leaves; its first value is at (0, 0, 0).
+
+    All of the array's lattice points are active. Leaves of zeros alone are left out.
+    """
+    if values.dtype == np.bool_ or values.dtype == np.float16:
+        values = values.astype(np.float32)
+    channels = values.shape[3:]
+    counts = [-(-n // LEAF_WIDTH) for n in values.shape[:3]]
+    # One slab of leaves along x at a time: the padded copy is never larger than a slab.
+    origins, leaves, masks = [], [], []
+    for bx in range(counts[0]):
+        part = values[bx * LEAF_WIDTH : (bx + 1) * LEAF_WIDTH]
+        slab = np.zeros(
+            (LEAF_WIDTH, *(c * LEAF_WIDTH for c in counts[1:]), *channels), values.dtype
+        )
+        inside = np.zeros(slab.shape[:3], bool)
+        slab[: part.shape[0], : part.shape[1], : part.shape[2]] = part
+        inside[: part.shape[0], : part.shape[1], : part.shape[2]] = True
+        blocks = _blocks(slab, counts[1], counts[2])
+        used = (blocks != 0).reshape(len(blocks), -1).any(axis=1)
+        at = np.argwhere(used.reshape(counts[1:]))
+        origins.append(np.column_stack([np.full(len(at), bx), at]) * LEAF_WIDTH)
+        leaves.append(blocks[used])
+        bits = _blocks(inside, counts[1], counts[2])[used].reshape(-1, LEAF_WIDTH**3)
+        masks.append(np.packbits(bits, axis=1, bitorder="little"))
+    return Tree(
+        background=np.zeros(channels, values.dtype),
+        leaf_origins=np.concatenate(origins).astype(np.int32),
+        leaf_values=np.concatenate(leaves),
+        leaf_masks=np.concatenate(masks),
+        tile_origins=np.empty((0, 3), np.int32),
+        tile_widths=np.empty(0, np.int32),
+        tile_values=np.empty((0, *channels), values.dtype),
+        tile_active=np.empty(0, bool),
+    )
+
+
+def _blocks(slab: NDArray[Any], ny: int, nz: int) -> NDArray[Any]:
+    """(8, 8 ny, 8 nz, ...) to (ny nz, 8, 8, 8, ...)."""
+    w = LEAF_WIDTH
+    split = slab.reshape(w, ny, w, nz, w, *slab.shape[3:])
+    order = (1, 3, 0, 2, 4, *range(5, split.ndim))
+    return np.ascontiguousarray(split.transpose(order)).reshape(ny * nz, w, w, w, *slab.shape[3:])
+
+
+def _array_header(file: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and dtype out of the header of a ``.npy`` stream."""
+    version = np.lib.format.read_magic(file)
+    read = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    if version not in read:
+        raise ValueError(f"unknown .npy version {version}")
+    shape, _, dtype = read[version](file, max_header_size=_MAX_HEADER)
+    return shape, dtype
+
+
+def _load(path: Path, name: str) -> NDArray[Any]:
+    try:
+        loaded = np.load(path, allow_pickle=False, mmap_mode="r" if path.suffix == ".npy" else None)
+        return loaded if path.suffix == ".npy" else loaded[name]
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise VolumeError(f"{path}: array '{name}' cannot be read: {error}") from error
+
+
+def _placement(path: Path, placed: dict[str, NDArray[Any]]) -> NDArray[np.float64]:
+    """(4, 4) world_from_index of a voxel size and an origin."""
+    world = np.eye(4)
+    try:
+        size = np.broadcast_to(np.asarray(placed.get("voxel_size", 1.0), np.float64), 3)
+        origin = np.broadcast_to(np.asarray(placed.get("origin", 0.0), np.float64), 3)
+    except ValueError as error:
+        raise VolumeError(
+            f"{path}: voxel_size must be one number or three, origin three: {error}"
+        ) from error
+    if not (np.isfinite(size).all() and (size != 0).all() and np.isfinite(origin).all()):
+        raise VolumeError(f"{path}: voxel_size {size} and origin {origin} make no lattice")
+    world[:3, :3] = np.diag(size)
+    world[:3, 3] = origin
+    return world
+
+
+def _header(
+    name: str, shape: tuple[int, ...], dtype: np.dtype[Any], world: NDArray[np.float64]
+) -> GridHeader:
+    vector = len(shape) == 4 and shape[3] == 3
+    refusal = None
+    if not (len(shape) == 3 or vector):
+        refusal = f"array of shape {shape}: a grid is (x, y, z) or (x, y, z, 3)"
+    elif dtype.kind not in "fiub":
+        refusal = f"array of dtype {dtype}: a grid is of numbers"
+    elif 0 in shape:
+        refusal = f"array of shape {shape} is empty"
+    ends = tuple(n - 1 for n in shape[:3])
+    return GridHeader(
+        name=name,
+        label=name,
+        value_type="vec3" + dtype.name if vector else dtype.name,
+        grid_class="fog volume" if not vector else "unknown",
+        map_type="ScaleTranslateMap",
+        world_from_index=world,
+        background=0.0,
+        active_voxels=int(np.prod(shape[:3])),
+        active_box=((0, 0, 0), ends) if len(ends) == 3 else None,
+        stored="dense",
+        refusal=refusal,
+    )

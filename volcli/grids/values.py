@@ -1,0 +1,74 @@
+"""Values that cannot be rendered as they are: NaN, Inf, and densities below 0."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from volcli.errors import VolumeError
+from volcli.grids.tree import Tree
+
+
+def settle_nonfinite(tree: Tree, where: str, nonfinite: str) -> tuple[Tree, list[str]]:
+    """The tree with values that float32 can hold, and warnings.
+
+    Parameters
+    ----------
+    where
+        File and grid, for messages.
+    nonfinite
+        ``error``: NaN and Inf raise; ``zero``: they become 0, with a warning.
+
+    Raises
+    ------
+    VolumeError
+        Naming how many there are, and the index of the first.
+    """
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes Inf, and is found below
+        parts = [p.astype(np.float32, copy=False) for p in _parts(tree)]
+    bad = [~np.isfinite(p) for p in parts]
+    count = sum(int(np.count_nonzero(b)) for b in bad)
+    if count == 0:
+        return _with_parts(tree, parts), []
+    first = _first_index(tree, bad)
+    if nonfinite == "error":
+        raise VolumeError(
+            f"{where}: {count} values are NaN or Inf, the first at index {first}; mend the file or "
+            f"accept them as 0 with --set density.nonfinite=zero"
+        )
+    settled = [np.where(b, np.float32(0), p) for p, b in zip(parts, bad, strict=True)]
+    return _with_parts(tree, settled), [f"{where}: {count} values are NaN or Inf, taken as 0"]
+
+
+def clamp_negative(tree: Tree, where: str) -> tuple[Tree, list[str]]:
+    """The tree with values below 0 raised to 0, and a warning that counts them."""
+    parts = _parts(tree)
+    count = sum(int(np.count_nonzero(p < 0)) for p in parts)
+    if count == 0:
+        return tree, []
+    clamped = [np.maximum(p, p.dtype.type(0)) for p in parts]
+    return _with_parts(tree, clamped), [f"{where}: {count} values below 0, taken as 0"]
+
+
+def _parts(tree: Tree) -> list[NDArray[Any]]:
+    return [tree.leaf_values, tree.tile_values, np.asarray(tree.background)]
+
+
+def _with_parts(tree: Tree, parts: list[NDArray[Any]]) -> Tree:
+    leaves, tiles, background = parts
+    return replace(tree, leaf_values=leaves, tile_values=tiles, background=background)
+
+
+def _first_index(tree: Tree, bad: list[NDArray[np.bool_]]) -> str:
+    leaves, tiles, _ = bad
+    if leaves.any():
+        at = np.unravel_index(int(np.argmax(leaves)), leaves.shape)
+        index = tree.leaf_origins[at[0]] + np.array(at[1:4], np.int64)
+    elif tiles.any():
+        index = tree.tile_origins[np.unravel_index(int(np.argmax(tiles)), tiles.shape)[0]]
+    else:
+        return "outside all voxels (the grid's background)"
+    return "(" + ", ".join(str(int(i)) for i in index) + ")"

@@ -1,0 +1,208 @@
+"""What a ray sees of a source of radiance: spans of the ray, sampled and weighted.
+
+A span is a part of the ray over which density is one cubic and colour is one cell of its own
+lattice. Each span adds ``T (1 - exp(-tau)) sum_i w_i c(t_i)``, with the weights of
+`cell.hit_weights`; the expected hit distance is the same sum with c = t. The colour grid may lie on
+another lattice than the density: then a density cell is cut where the ray crosses the planes of
+that lattice, and the rule keeps its order.
+
+``colour`` and ``depth`` are None where the scene has no such term; numba compiles a version without
+it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from volcli.kernels.cell import (
+    MAX_SPLIT,
+    MAX_TAU,
+    absorbed,
+    antiderivative,
+    hit_weights,
+    trilinear,
+)
+from volcli.kernels.compiler import jit
+from volcli.kernels.traversal import brick_entry
+
+STOP_TAU = 24.0 * math.log(2.0)
+"""Beyond this optical depth T < 2^-24: radiance in float32 can no longer change."""
+
+
+class State(NamedTuple):
+    """What is known of a ray up to some distance.
+
+    Attributes
+    ----------
+    tau
+        Optical depth.
+    T
+        Transmittance, exp(-tau): kept up within a brick, taken afresh from tau at the next.
+    r, g, b
+        Radiance.
+    moment
+        The integral of t T sigma dt, for the expected hit distance.
+    """
+
+    tau: float
+    T: float
+    r: float
+    g: float
+    b: float
+    moment: float
+
+
+class Colour(NamedTuple):
+    """A colour grid beside a density grid.
+
+    Attributes
+    ----------
+    grid
+        `BrickArrays` with three channels.
+    local_from_world
+        (3, 4) float64.
+    same_lattice
+        True, or None when its lattice is another than the density's.
+    shift
+        (3,) int64: local voxel of the colour grid minus that of the density; of use on the same
+        lattice only.
+    """
+
+    grid: Any
+    local_from_world: NDArray[np.float64]
+    same_lattice: Any
+    shift: NDArray[np.int64]
+
+
+@jit
+def colour_cell(colour, ray, t, t_end):
+    """The colour cell that the ray is in just after t, and where the ray leaves it.
+
+    Returns (t_exit, cell): cell is (entry, i, j, k), a brick and the local voxel of the cell, or a
+    constant, and then t_exit is where the ray leaves the cube that it fills. ``ray`` is in voxels
+    of the colour grid.
+    """
+    i, tx = cell_after(ray, 0, t, 1)
+    j, ty = cell_after(ray, 1, t, 1)
+    k, tz = cell_after(ray, 2, t, 1)
+    entry, width = brick_entry(colour.grid, i, j, k)
+    if entry < 0:
+        tx = cell_after(ray, 0, t, width)[1]
+        ty = cell_after(ray, 1, t, width)[1]
+        tz = cell_after(ray, 2, t, width)[1]
+    return min(min(tx, ty), min(tz, t_end)), (entry, i, j, k)
+
+
+@jit
+def cell_after(ray, axis, t, width):
+    """(lowest voxel of the aligned cell just after t, where it ends), along one axis."""
+    o, d, inverse = ray.o[axis], ray.d[axis], ray.inverse[axis]
+    crossed = t + 1e-13 * max(1.0, t)  # a plane nearer than this is behind us
+    cell = math.floor((o + t * d) / width)
+    if d > 0.0:
+        end = ((cell + 1) * width - o) * inverse
+        if end <= crossed:
+            cell += 1
+            end = ((cell + 1) * width - o) * inverse
+        return cell * width, end
+    if d < 0.0:
+        end = (cell * width - o) * inverse
+        if end <= crossed:
+            cell -= 1
+            end = (cell * width - o) * inverse
+        return cell * width, end
+    return cell * width, math.inf
+
+
+@jit
+def colour_at(colour, nearest, cell, ray, t):
+    """(r, g, b) at distance t, in a cell (entry, i, j, k) of the colour grid."""
+    entry, i, j, k = cell
+    if entry < 0:
+        c = colour.grid.constants[-1 - entry]
+        return float(c[0]), float(c[1]), float(c[2])
+    b = ((i & 7) * 9 + (j & 7)) * 9 + (k & 7)
+    a = colour.grid.atlas[entry]
+    if nearest is not None:
+        return float(a[b, 0]), float(a[b, 1]), float(a[b, 2])
+    x = ray.o[0] + t * ray.d[0] - i
+    y = ray.o[1] + t * ray.d[1] - j
+    z = ray.o[2] + t * ray.d[2] - k
+    return channel(a, b, 0, x, y, z), channel(a, b, 1, x, y, z), channel(a, b, 2, x, y, z)
+
+
+@jit
+def channel(a, b, c, x, y, z):
+    """One channel at (x, y, z) in the cell whose first corner is value b of the brick a."""
+    v = (
+        float(a[b, c]),
+        float(a[b + 1, c]),
+        float(a[b + 9, c]),
+        float(a[b + 10, c]),
+        float(a[b + 81, c]),
+        float(a[b + 82, c]),
+        float(a[b + 90, c]),
+        float(a[b + 91, c]),
+    )
+    return trilinear(v, x, y, z)
+
+
+@jit
+def add_span(state, p, scale, tm, t0, t1, colour, nearest, depth, cell, ray):
+    """Add the light of [t0, t1] to the state.
+
+    ``p`` is the density's cubic about the distance ``tm``; ``cell`` is the colour's, and ``ray`` is
+    in voxels of the colour grid. A span of optical depth above `MAX_TAU` is split.
+    """
+    whole = max(0.0, scale * (antiderivative(p, t1 - tm) - antiderivative(p, t0 - tm)))
+    if whole <= 0.0:
+        return state
+    parts = 1
+    if whole > MAX_TAU:
+        parts = int(min(math.ceil(whole / MAX_TAU), MAX_SPLIT))
+    width = (t1 - t0) / parts
+    _, T, r, g, b, moment = state
+    for part in range(parts):
+        u0 = t0 + part * width - tm
+        tau, u, w = hit_weights(p, scale, u0, u0 + width)
+        hit = T * absorbed(tau)
+        T -= hit
+        if colour is not None:
+            for n in range(3):
+                cr, cg, cb = colour_at(colour, nearest, cell, ray, tm + u[n])
+                r += hit * w[n] * cr
+                g += hit * w[n] * cg
+                b += hit * w[n] * cb
+        if depth is not None:
+            moment += hit * (tm + u[0] * w[0] + u[1] * w[1] + u[2] * w[2])
+    return State(state.tau + whole, T, r, g, b, moment)
+
+
+@jit
+def add_spans(state, p, scale, tm, t0, t1, colour, nearest, depth, ray):
+    """As `add_span`, cut where the ray crosses the planes of the colour's own lattice."""
+    t = t0
+    while t < t1:
+        t_exit, cell = colour_cell(colour, ray, t, t1)
+        state = add_span(state, p, scale, tm, t, t_exit, colour, nearest, depth, cell, ray)
+        t = t_exit
+    return state
+
+
+@jit
+def darken(state, tau):
+    """The state after an optical depth of tau whose light is not asked for, or too weak to count.
+
+    T is left behind: it is taken afresh from tau before it is used again.
+    """
+    return State(state.tau + tau, state.T, state.r, state.g, state.b, state.moment)
+
+
+@jit
+def refresh(state):
+    """The state with T taken from tau, so that no product of many factors builds up."""
+    return State(state.tau, math.exp(-state.tau), state.r, state.g, state.b, state.moment)

@@ -1,0 +1,235 @@
+"""A plan, its grids and a camera to arrays: the flow of an image.
+
+Tiles of rays are shared out among threads (the kernels release the interpreter lock); each writes
+its own part of the image. Nothing here reads or writes files.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from volcli.camera import Camera
+from volcli.errors import NonFiniteError
+from volcli.grids import BrickGrid, Progress
+from volcli.plan import Plan
+
+Floats = NDArray[np.float32]
+
+TILE = 32
+"""Edge of a tile in pixels: its rays share bricks, and there are enough tiles for all threads."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is rendered.
+
+    Attributes
+    ----------
+    density
+        The density grid.
+    scale
+        Extinction per unit of density, 1 / world unit.
+    color
+        A grid of radiance, or one radiance (r, g, b).
+    """
+
+    density: BrickGrid
+    scale: float
+    color: BrickGrid | tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class RenderResult:
+    """A rendered image, without its background.
+
+    Attributes
+    ----------
+    radiance
+        (h, w, 3) float32: light of the volume alone, so premultiplied.
+    optical_depth, transmittance, opacity
+        (h, w) float32: tau, exp(-tau) and 1 - exp(-tau), each rounded once from float64.
+    depth
+        (h, w) float32: the expected hit distance along the camera's axis, world units, +inf where
+        nothing can be hit; None when the plan leaves it out.
+    evaluations
+        Cells, or samples of the midpoint rule.
+    compile_seconds, render_seconds
+        Time to have the kernel ready, and to run it.
+    """
+
+    radiance: Floats
+    optical_depth: Floats
+    transmittance: Floats
+    opacity: Floats
+    depth: Floats | None
+    evaluations: int
+    compile_seconds: float
+    render_seconds: float
+
+
+def available_threads() -> int:
+    """The processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def render(
+    scene: Scene,
+    plan: Plan,
+    camera: Camera,
+    *,
+    threads: int | None = None,
+    on_compiled: Callable[[], None] | None = None,
+    progress: Progress | None = None,
+) -> RenderResult:
+    """Render an image.
+
+    Parameters
+    ----------
+    scene, plan, camera
+        What, how and from where.
+    threads
+        Default: the processors that this process may use. The image does not depend on it.
+    on_compiled
+        Called once the kernel is ready.
+    progress
+        Called with tiles done and tiles in all.
+
+    Raises
+    ------
+    NonFiniteError
+        If a pixel is NaN or Inf, naming the first.
+    """
+    width, height = camera.resolution
+
+    def layer(value: float, *channels: int) -> Floats:
+        return np.full((height, width, *channels), value, np.float32)
+
+    tau, transmittance, opacity, light = layer(0), layer(1), layer(0), layer(0, 3)
+    depth = layer(np.inf) if plan.depth else None
+    constant = np.array(scene.color) if isinstance(scene.color, tuple) else None
+
+    begin = time.perf_counter()
+    integrate = _integrator(scene, plan)
+    nothing = np.empty((0, 3))
+    integrate(nothing, nothing)  # compiles
+    compiled = time.perf_counter()
+    if on_compiled is not None:
+        on_compiled()
+
+    def one_tile(corner: tuple[int, int]) -> int:
+        rows = slice(corner[0], min(corner[0] + TILE, height))
+        columns = slice(corner[1], min(corner[1] + TILE, width))
+        origins, directions = camera.rays(rows, columns)
+        tile_tau, tile_light, tile_distance, evaluations = integrate(origins, directions)
+        tile_opacity = -np.expm1(-tile_tau)
+        if constant is not None:
+            tile_light = tile_opacity[:, None] * constant
+        shape = tau[rows, columns].shape
+        tau[rows, columns] = tile_tau.reshape(shape)
+        transmittance[rows, columns] = np.exp(-tile_tau).reshape(shape)
+        opacity[rows, columns] = tile_opacity.reshape(shape)
+        light[rows, columns] = tile_light.reshape(*shape, 3)
+        if depth is not None:
+            depth[rows, columns] = (tile_distance * camera.axial(directions)).reshape(shape)
+        return evaluations
+
+    evaluations = 0
+    tiles = [(y, x) for y in range(0, height, TILE) for x in range(0, width, TILE)]
+    if not scene.density.is_empty:
+        pool = ThreadPoolExecutor(threads or available_threads())
+        try:
+            for done, count in enumerate(pool.map(one_tile, tiles), start=1):
+                evaluations += count
+                if progress is not None:
+                    progress(done, len(tiles))
+        finally:  # an interrupt does not wait for the tiles that are still to come
+            pool.shutdown(wait=True, cancel_futures=True)
+    result = RenderResult(
+        radiance=light,
+        optical_depth=tau,
+        transmittance=transmittance,
+        opacity=opacity,
+        depth=depth,
+        evaluations=evaluations,
+        compile_seconds=compiled - begin,
+        render_seconds=time.perf_counter() - compiled,
+    )
+    _check_finite(result)
+    return result
+
+
+def over(result: RenderResult, background: Floats | None) -> Floats:
+    """(h, w, 4) float32, premultiplied: the picture, C + T c_background.
+
+    Parameters
+    ----------
+    background
+        (h, w, 4), or (4,), premultiplied; None: nothing is behind the volume.
+    """
+    if background is None:
+        return np.dstack([result.radiance, result.opacity])
+    behind = result.transmittance[..., None] * np.asarray(background, np.float32)
+    return np.dstack([result.radiance, result.opacity]) + behind
+
+
+def _integrator(
+    scene: Scene, plan: Plan
+) -> Callable[[NDArray[Any], NDArray[Any]], tuple[Any, ...]]:
+    """A function of (origins, directions) to (tau, radiance, distance, evaluations)."""
+    from volcli.kernels.rays import Density, integrate_rays
+    from volcli.kernels.source import Colour
+
+    grid = scene.density
+    interpolation = "nearest" if plan.nearest else "linear"
+    density = Density(
+        grid.arrays, grid.local_from_world, grid.support(interpolation), float(scene.scale)
+    )
+    colour = None
+    if isinstance(scene.color, BrickGrid):
+        same = np.array_equal(grid.world_from_index, scene.color.world_from_index)
+        colour = Colour(
+            scene.color.arrays,
+            scene.color.local_from_world,
+            True if same else None,
+            grid.origin - scene.color.origin,
+        )
+
+    def integrate(origins: NDArray[Any], directions: NDArray[Any]) -> tuple[Any, ...]:
+        n = len(origins)
+        tau, light = np.zeros(n), np.zeros((n, 3))
+        distance = np.empty(n) if plan.depth else None
+        evaluations = integrate_rays(
+            origins,
+            directions,
+            density,
+            colour,
+            plan.step_voxels,
+            True if plan.nearest else None,
+            distance,
+            plan.stop,
+            tau,
+            light,
+        )
+        return tau, light, distance, int(evaluations)
+
+    return integrate
+
+
+def _check_finite(result: RenderResult) -> None:
+    bad = ~np.isfinite(result.optical_depth) | ~np.isfinite(result.radiance).all(axis=-1)
+    if result.depth is not None:
+        bad |= np.isnan(result.depth)
+    if bad.any():
+        y, x = (int(v) for v in np.argwhere(bad)[0])
+        raise NonFiniteError(
+            f"{int(bad.sum())} pixels are NaN or Inf, the first at x={x}, y={y} (optical depth "
+            f"{result.optical_depth[y, x]:g}); a smaller density.scale may help"
+        )
