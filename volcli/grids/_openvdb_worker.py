@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 try:
-    import openvdb
+    import openvdb  # type: ignore[import-not-found]
 except ImportError:
-    import pyopenvdb as openvdb
+    import pyopenvdb as openvdb  # type: ignore[import-not-found]
 
 Array = np.ndarray[Any, Any]
 Point = tuple[int, ...]
@@ -190,8 +190,8 @@ def leaf_masks(grid: Any, nodes: list[list[Point]], values: Array) -> Array:
     if values.dtype == bool:
         changed.mapOn(operator.not_)
     else:
-        mark = next(n for n in itertools.count(1) if not (values == n).any())
-        mark = grid.background.__class__(mark) if values.ndim == 4 else (mark,) * 3
+        number = next(n for n in itertools.count(1) if not (values == n).any())
+        mark: Any = type(grid.background)(number) if values.ndim == 4 else (number,) * 3
         changed.mapOn(lambda value: mark)
     after = leaf_values(changed, nodes, values.dtype, values.shape[4:])
     active = (after != values) & ~((after != after) & (values != values))

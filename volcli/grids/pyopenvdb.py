@@ -46,7 +46,7 @@ module.read
 import numpy
 """
 _PROBE_SECONDS = 60
-_WORKER_SECONDS = 1800
+_WORKER_SECONDS = {"headers": 60, "tree": 1800}  # damaged files have kept the library busy
 _TREE_ARRAYS = tuple(Tree.__dataclass_fields__)
 
 
@@ -163,11 +163,13 @@ def _run_worker(where: str, task: str, path: Path, out: Path, *rest: str) -> Non
             stdin=subprocess.DEVNULL,
             capture_output=True,
             env=_environment(),
-            timeout=_WORKER_SECONDS,
+            timeout=_WORKER_SECONDS[task],
             check=False,
         )
     except subprocess.TimeoutExpired as error:
-        raise VolumeError(f"{where}: no answer in {_WORKER_SECONDS} s from OpenVDB") from error
+        raise VolumeError(
+            f"{where}: no answer from OpenVDB's library in {error.timeout:g} s"
+        ) from error
     if done.returncode == 0:
         return
     if done.returncode == _WORKER_FAILED and (out / "error.txt").is_file():
