@@ -186,6 +186,7 @@ def _integrator(
     """A function of (origins, directions) to (tau, radiance, distance, evaluations)."""
     from volcli.kernels.rays import Density, integrate_rays
     from volcli.kernels.source import Colour
+    from volcli.kernels.traversal import segment_buffer
 
     grid = scene.density
     interpolation = "nearest" if plan.nearest else "linear"
@@ -217,6 +218,7 @@ def _integrator(
             plan.stop,
             tau,
             light,
+            segment_buffer(),
         )
         return tau, light, distance, int(evaluations)
 

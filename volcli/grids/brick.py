@@ -124,7 +124,7 @@ class BrickGrid:
     @property
     def local_from_world(self) -> NDArray[np.float64]:
         """(3, 4): from world units to local voxels."""
-        m: NDArray[np.float64] = np.linalg.inv(self.world_from_index)[:3]
+        m = np.linalg.inv(self.world_from_index)[:3].astype(np.float64)
         m[:, 3] -= self.origin
         return m
 

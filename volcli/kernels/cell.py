@@ -35,16 +35,15 @@ MAX_SPLIT = 1024
 def load(atlas, brick, i, j, k):
     """The eight corner values of cell (i, j, k) of a brick, as float64, z fastest."""
     b = (i * 9 + j) * 9 + k
-    a = atlas[brick]
     return (
-        float(a[b]),
-        float(a[b + 1]),
-        float(a[b + 9]),
-        float(a[b + 10]),
-        float(a[b + 81]),
-        float(a[b + 82]),
-        float(a[b + 90]),
-        float(a[b + 91]),
+        float(atlas[brick, b]),
+        float(atlas[brick, b + 1]),
+        float(atlas[brick, b + 9]),
+        float(atlas[brick, b + 10]),
+        float(atlas[brick, b + 81]),
+        float(atlas[brick, b + 82]),
+        float(atlas[brick, b + 90]),
+        float(atlas[brick, b + 91]),
     )
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from volcli.kernels.compiler import jit
+from volcli.kernels.compiler import jit, kernel
 from volcli.kernels.rules import exact_brick, exact_constant, midpoint_segment
 from volcli.kernels.source import STOP_TAU, State, refresh
 from volcli.kernels.traversal import (
@@ -28,7 +28,6 @@ from volcli.kernels.traversal import (
     root_exit,
     root_next,
     root_segments,
-    segment_buffer,
 )
 
 
@@ -54,12 +53,13 @@ class Density(NamedTuple):
 
 
 @jit
-def to_local(m, v, w):
-    """The first three rows of an affine matrix on the point (w = 1) or direction (w = 0) v."""
+def to_local(m, vectors, n, w):
+    """The affine matrix m (3, 4) on vector n: a point (w = 1) or a direction (w = 0)."""
+    x, y, z = vectors[n, 0], vectors[n, 1], vectors[n, 2]
     return (
-        m[0, 0] * v[0] + m[0, 1] * v[1] + m[0, 2] * v[2] + m[0, 3] * w,
-        m[1, 0] * v[0] + m[1, 1] * v[1] + m[1, 2] * v[2] + m[1, 3] * w,
-        m[2, 0] * v[0] + m[2, 1] * v[1] + m[2, 2] * v[2] + m[2, 3] * w,
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] * w,
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] * w,
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] * w,
     )
 
 
@@ -69,7 +69,7 @@ def move(o, d, t, shift):
     return o[0] + t * d[0] + shift, o[1] + t * d[1] + shift, o[2] + t * d[2] + shift
 
 
-@jit
+@kernel
 def integrate_rays(
     origins,
     directions,
@@ -81,6 +81,7 @@ def integrate_rays(
     stop,
     optical_depth,
     radiance,
+    buffer,
 ):
     """Integrate a batch of rays.
 
@@ -103,6 +104,8 @@ def integrate_rays(
         Whether a ray ends where T < 2^-24; if not, optical depth goes on to the end.
     optical_depth, radiance
         (n,) and (n, 3) float64, written.
+    buffer
+        `traversal.segment_buffer`, room for the work of one thread.
 
     Returns
     -------
@@ -110,22 +113,22 @@ def integrate_rays(
     """
     grid = density.grid
     skip_background = grid.constants[0] == 0.0
-    lo, hi = density.support[0], density.support[1]
+    box = density.support
+    lo, hi = (box[0, 0], box[0, 1], box[0, 2]), (box[1, 0], box[1, 1], box[1, 2])
     # With nearest, voxel (i, j, k) is the unit cube around its lattice point: half a voxel's
     # shift makes it the cell (i, j, k).
     shift = 0.0 if nearest is None else 0.5
-    buffer = segment_buffer()
     evaluated = 0
     for n in range(len(origins)):
-        eye = to_local(density.local_from_world, origins[n], 1.0)
-        d = to_local(density.local_from_world, directions[n], 0.0)
+        eye = to_local(density.local_from_world, origins, n, 1.0)
+        d = to_local(density.local_from_world, directions, n, 0.0)
         t_near, t_far = clip(lo, hi, eye, d)
         ray = make_ray(move(eye, d, t_near, shift), d)
         t_far -= t_near
         colour_ray = ray
         if colour is not None:
-            colour_d = to_local(colour.local_from_world, directions[n], 0.0)
-            eye = to_local(colour.local_from_world, origins[n], 1.0)
+            colour_d = to_local(colour.local_from_world, directions, n, 0.0)
+            eye = to_local(colour.local_from_world, origins, n, 1.0)
             colour_ray = make_ray(move(eye, colour_d, t_near, shift), colour_d)
         step = 0.0
         if step_voxels is not None:
@@ -146,7 +149,7 @@ def integrate_rays(
                 t = t_exit
             for s in range(segments):
                 t0, t1 = buffer.times[s, 0], buffer.times[s, 1]
-                entry = buffer.entries[s]
+                entry = int(buffer.entries[s])
                 corner = (buffer.corners[s, 0], buffer.corners[s, 1], buffer.corners[s, 2])
                 if colour is not None or depth is not None:
                     state = refresh(state)

@@ -123,30 +123,35 @@ def colour_at(colour, nearest, cell, ray, t):
     """(r, g, b) at distance t, in a cell (entry, i, j, k) of the colour grid."""
     entry, i, j, k = cell
     if entry < 0:
-        c = colour.grid.constants[-1 - entry]
-        return float(c[0]), float(c[1]), float(c[2])
+        constants = colour.grid.constants
+        at = -1 - entry
+        return float(constants[at, 0]), float(constants[at, 1]), float(constants[at, 2])
+    atlas = colour.grid.atlas
     b = ((i & 7) * 9 + (j & 7)) * 9 + (k & 7)
-    a = colour.grid.atlas[entry]
     if nearest is not None:
-        return float(a[b, 0]), float(a[b, 1]), float(a[b, 2])
+        return float(atlas[entry, b, 0]), float(atlas[entry, b, 1]), float(atlas[entry, b, 2])
     x = ray.o[0] + t * ray.d[0] - i
     y = ray.o[1] + t * ray.d[1] - j
     z = ray.o[2] + t * ray.d[2] - k
-    return channel(a, b, 0, x, y, z), channel(a, b, 1, x, y, z), channel(a, b, 2, x, y, z)
+    return (
+        channel(atlas, entry, b, 0, x, y, z),
+        channel(atlas, entry, b, 1, x, y, z),
+        channel(atlas, entry, b, 2, x, y, z),
+    )
 
 
 @jit
-def channel(a, b, c, x, y, z):
-    """One channel at (x, y, z) in the cell whose first corner is value b of the brick a."""
+def channel(atlas, brick, b, c, x, y, z):
+    """Channel c at (x, y, z) in the cell of a brick whose first corner is value b."""
     v = (
-        float(a[b, c]),
-        float(a[b + 1, c]),
-        float(a[b + 9, c]),
-        float(a[b + 10, c]),
-        float(a[b + 81, c]),
-        float(a[b + 82, c]),
-        float(a[b + 90, c]),
-        float(a[b + 91, c]),
+        float(atlas[brick, b, c]),
+        float(atlas[brick, b + 1, c]),
+        float(atlas[brick, b + 9, c]),
+        float(atlas[brick, b + 10, c]),
+        float(atlas[brick, b + 81, c]),
+        float(atlas[brick, b + 82, c]),
+        float(atlas[brick, b + 90, c]),
+        float(atlas[brick, b + 91, c]),
     )
     return trilinear(v, x, y, z)
 

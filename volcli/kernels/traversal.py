@@ -67,8 +67,7 @@ class Segments(NamedTuple):
     corners: NDArray[np.int64]
 
 
-@jit
-def segment_buffer():
+def segment_buffer() -> Segments:
     """An empty `Segments`."""
     return Segments(
         np.empty((SEGMENTS, 2), np.float64),
@@ -140,9 +139,23 @@ def enter(grid, ray):
 
 
 @jit
+def last_below(ascending, x):
+    """The index of the last number that is not above x; -1 where all are. (np.searchsorted takes
+    seconds to compile.)"""
+    low, high = 0, len(ascending)
+    while low < high:
+        middle = (low + high) // 2
+        if ascending[middle] <= x:
+            low = middle + 1
+        else:
+            high = middle
+    return low - 1
+
+
+@jit
 def interval(planes, x, d):
     """The interval between planes that a ray in direction d is in just after x."""
-    cell = min(max(np.searchsorted(planes, x, side="right") - 1, 0), len(planes) - 2)
+    cell = min(max(last_below(planes, x), 0), len(planes) - 2)
     if d < 0.0 and cell > 0 and x == planes[cell]:
         cell -= 1
     return cell
@@ -207,9 +220,9 @@ def root_cell(grid, at):
 def root_entry(grid, i, j, k):
     """The entry of the root cell (i, j, k), counted in intervals between planes."""
     key = (i * (len(grid.planes_y) - 1) + j) * (len(grid.planes_z) - 1) + k
-    at = np.searchsorted(grid.root_keys, key)
-    if at < len(grid.root_keys) and grid.root_keys[at] == key:
-        return grid.root_entries[at]
+    at = last_below(grid.root_keys, key)
+    if at >= 0 and grid.root_keys[at] == key:
+        return int(grid.root_entries[at])
     return BACKGROUND
 
 
@@ -217,24 +230,22 @@ def root_entry(grid, i, j, k):
 def brick_entry(grid, i, j, k):
     """(entry, width): what stands at the local voxel (i, j, k), and the width of the aligned cube
     around it over which an entry that is a constant holds."""
-    x = np.searchsorted(grid.planes_x, float(i), side="right") - 1
-    y = np.searchsorted(grid.planes_y, float(j), side="right") - 1
-    z = np.searchsorted(grid.planes_z, float(k), side="right") - 1
-    if x < 0 or x >= len(grid.planes_x) - 1:
+    at = (
+        last_below(grid.planes_x, float(i)),
+        last_below(grid.planes_y, float(j)),
+        last_below(grid.planes_z, float(k)),
+    )
+    if not inside(grid, at):
         return BACKGROUND, ROOT
-    if y < 0 or y >= len(grid.planes_y) - 1:
-        return BACKGROUND, ROOT
-    if z < 0 or z >= len(grid.planes_z) - 1:
-        return BACKGROUND, ROOT
-    entry = root_entry(grid, x, y, z)
+    entry = root_entry(grid, at[0], at[1], at[2])
     if entry < 0:
         return entry, ROOT
-    at = ((i >> 7 & 31) * 32 + (j >> 7 & 31)) * 32 + (k >> 7 & 31)
-    entry = grid.upper[entry, at]
+    block = ((i >> 7 & 31) * 32 + (j >> 7 & 31)) * 32 + (k >> 7 & 31)
+    entry = int(grid.upper[entry, block])
     if entry < 0:
         return entry, BLOCK
-    at = ((i >> 3 & 15) * 16 + (j >> 3 & 15)) * 16 + (k >> 3 & 15)
-    return grid.lower[entry, at], BRICK
+    brick = ((i >> 3 & 15) * 16 + (j >> 3 & 15)) * 16 + (k >> 3 & 15)
+    return int(grid.lower[entry, brick]), BRICK
 
 
 @jit
@@ -263,7 +274,7 @@ def root_segments(grid, skip_background, entry, corner, ray, t0, t1, buffer):
         if skip_background and entry == BACKGROUND:
             return 0
         return put(buffer, 0, t0, t1, entry, x, y, z)
-    upper = grid.upper[entry]
+    upper = grid.upper
     i, tx, ddx, sx = start(ray, 0, t0, x, BLOCK, 32)
     j, ty, ddy, sy = start(ray, 1, t0, y, BLOCK, 32)
     k, tz, ddz, sz = start(ray, 2, t0, z, BLOCK, 32)
@@ -271,7 +282,7 @@ def root_segments(grid, skip_background, entry, corner, ray, t0, t1, buffer):
     t = t0
     while True:
         t_exit = min(min(tx, ty), min(tz, t1))
-        e = upper[(i * 32 + j) * 32 + k]
+        e = int(upper[entry, (i * 32 + j) * 32 + k])
         if t_exit > t and not (skip_background and e == BACKGROUND):
             bx, by, bz = x + i * BLOCK, y + j * BLOCK, z + k * BLOCK
             if e >= 0:
@@ -289,16 +300,17 @@ def root_segments(grid, skip_background, entry, corner, ray, t0, t1, buffer):
 @jit
 def block_segments(grid, skip_background, entry, x, y, z, ray, t0, t1, buffer, n):
     """As `root_segments`, for the occupied macro cells of the block with lowest voxel (x, y, z)."""
-    occupied = grid.occupied[entry]
-    lower = grid.lower[entry]
+    occupied = grid.occupied
     i, tx, ddx, sx = start(ray, 0, t0, x, MACRO, 4)
     j, ty, ddy, sy = start(ray, 1, t0, y, MACRO, 4)
     k, tz, ddz, sz = start(ray, 2, t0, z, MACRO, 4)
     t = t0
     while True:
         t_exit = min(min(tx, ty), min(tz, t1))
-        if t_exit > t and (occupied[(i * 4 + j) * 4 + k] or not skip_background):
-            n = macro_segments(lower, skip_background, i, j, k, x, y, z, ray, t, t_exit, buffer, n)
+        if t_exit > t and (occupied[entry, (i * 4 + j) * 4 + k] or not skip_background):
+            n = macro_segments(
+                grid, skip_background, entry, i, j, k, x, y, z, ray, t, t_exit, buffer, n
+            )
         t = max(t, t_exit)
         if t_exit >= t1:
             return n
@@ -308,8 +320,9 @@ def block_segments(grid, skip_background, entry, x, y, z, ray, t0, t1, buffer, n
 
 
 @jit
-def macro_segments(lower, skip_background, mi, mj, mk, x, y, z, ray, t0, t1, buffer, n):
+def macro_segments(grid, skip_background, entry, mi, mj, mk, x, y, z, ray, t0, t1, buffer, n):
     """As `root_segments`, for the bricks of macro cell (mi, mj, mk) of the block at (x, y, z)."""
+    lower = grid.lower
     first = (mi * 64 + mj * 4) * 16 + mk * 4
     x += mi * MACRO
     y += mj * MACRO
@@ -320,7 +333,7 @@ def macro_segments(lower, skip_background, mi, mj, mk, x, y, z, ray, t0, t1, buf
     t = t0
     while True:
         t_exit = min(min(tx, ty), min(tz, t1))
-        e = lower[first + (i * 16 + j) * 16 + k]
+        e = int(lower[entry, first + (i * 16 + j) * 16 + k])
         if t_exit > t and not (skip_background and e == BACKGROUND):
             n = put(buffer, n, t, t_exit, e, x + i * BRICK, y + j * BRICK, z + k * BRICK)
         t = max(t, t_exit)
