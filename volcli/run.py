@@ -1,6 +1,7 @@
-"""A job from files to files: open, plan, read, render, write. The one way a picture is made.
+"""A job from files to files: `prepare` opens and plans, `load` reads, `run` renders and writes.
 
-`volcli render` calls it once. It prints nothing; progress and results go to the caller.
+The one way a picture is made; `volcli render` calls each once. It prints nothing; progress and
+results go to the caller.
 """
 
 from __future__ import annotations
@@ -15,17 +16,28 @@ from typing import Any
 
 import numpy as np
 
-from volcli import __version__, images
+import volcli
+from volcli import images
 from volcli.camera import Camera, make_camera
 from volcli.config import job_as_toml
-from volcli.errors import UsageError
-from volcli.grids import BrickGrid, Volume, load_color, load_density, open_volume
+from volcli.errors import OutputError, UsageError
+from volcli.grids import (
+    BrickGrid,
+    GridHeader,
+    Progress,
+    Volume,
+    load_color,
+    load_density,
+    open_volume,
+)
 from volcli.plan import Plan, make_plan
 from volcli.render import RenderResult, Scene, over, render
 from volcli.schema import Job
 
 OnStage = Callable[[str, int, int], None]
-"""Called as ``on_stage(stage, done, total)``; stages are reading, compiling, rendering, writing."""
+"""Called as ``on_stage(stage, done, total)``; a stage is one of ``reading GRID``, ``compiling``,
+``rendering``, ``writing``.
+"""
 
 
 @dataclass(frozen=True)
@@ -46,8 +58,28 @@ class Prepared:
 
 
 @dataclass(frozen=True)
+class Loaded:
+    """The grids that a job needs, in memory.
+
+    Attributes
+    ----------
+    density, color
+        The density, and the colour: a grid or one radiance.
+    warnings
+        What was changed in the values on the way.
+    seconds
+        How long reading took.
+    """
+
+    density: BrickGrid
+    color: BrickGrid | tuple[float, float, float]
+    warnings: tuple[str, ...]
+    seconds: float
+
+
+@dataclass(frozen=True)
 class Report:
-    """What a job did, as ``render --json`` prints it.
+    """What a job did.
 
     Attributes
     ----------
@@ -59,8 +91,6 @@ class Report:
         ``load``, ``compile``, ``render``, ``write``.
     transmittance
         ``min``, ``mean``, ``max`` over the pixels.
-    grids
-        Bytes held by each grid that was read.
     """
 
     image: str | None
@@ -72,13 +102,17 @@ class Report:
     seconds: dict[str, float]
     transmittance: dict[str, float]
     camera: dict[str, Any]
-    grids: dict[str, int]
     peak_memory_bytes: int
     warnings: list[str]
 
 
-def prepare(job: Job, *, overwrite: bool = True) -> Prepared:
+def prepare(job: Job, *, overwrite: bool = True, writes: bool = True) -> Prepared:
     """Open and check all that a job names, before any work: volume, grids, outputs, background.
+
+    Parameters
+    ----------
+    writes
+        Whether there must be an output; else a job without one is planned as if for an EXR.
 
     Raises
     ------
@@ -86,13 +120,17 @@ def prepare(job: Job, *, overwrite: bool = True) -> Prepared:
         Whatever is wrong first.
     """
     files = _outputs(job)
+    if writes and not files:
+        raise UsageError("nothing to write: give -o OUT.exr (or output.image in the job)")
     for path in files.values():
+        if path.is_dir():
+            raise OutputError(f"{path}: is a folder; name a file inside it, such as picture.exr")
         images.check_output(path, overwrite=overwrite)
     if job.density.file is None:
         raise UsageError("no volume: the job has no density.file; give one")
     volume = open_volume(job.density.file, job.density.reader)
-    layers = set(files)
-    if "picture" in files and files["picture"].suffix.lower() == ".exr":
+    layers = {"picture", *job.output.maps}
+    if not files or files["picture"].suffix.lower() == ".exr":
         layers |= {"transmittance", "optical_depth", "depth"}
     plan = make_plan(job, volume, frozenset(layers))
     background = None
@@ -103,43 +141,54 @@ def prepare(job: Job, *, overwrite: bool = True) -> Prepared:
     return Prepared(job, volume, plan, files, background)
 
 
+def load(prepared: Prepared, on_stage: OnStage = lambda stage, done, total: None) -> Loaded:
+    """Read the grids that the plan names.
+
+    Raises
+    ------
+    VolumeError
+        A file is damaged, or holds NaN or Inf where the job does not accept them.
+    """
+    job, plan, volume = prepared.job, prepared.plan, prepared.volume
+
+    def progress(header: GridHeader) -> Progress:
+        return lambda done, total: on_stage(f"reading {header.label}", done, total)
+
+    begin = time.perf_counter()
+    density, warnings = load_density(
+        volume, plan.density, job.density.nonfinite, progress(plan.density)
+    )
+    color: BrickGrid | tuple[float, float, float] = job.color.value
+    if plan.color is not None:
+        color, notes = load_color(volume, plan.color, job.density.nonfinite, progress(plan.color))
+        warnings = [*warnings, *notes]
+    return Loaded(density, color, tuple(warnings), time.perf_counter() - begin)
+
+
 def run(
     prepared: Prepared,
+    loaded: Loaded,
     *,
     threads: int | None = None,
     overwrite: bool = True,
     on_stage: OnStage = lambda stage, done, total: None,
 ) -> Report:
-    """Read, render and write a prepared job.
+    """Render and write a job.
 
     Raises
     ------
-    VolumeError, OutputError, NonFiniteError, UsageError
-        A file is damaged; a result cannot be written; a pixel is NaN or Inf; the camera the job
-        asks for has no frame.
+    OutputError, NonFiniteError, UsageError
+        A result cannot be written; a pixel is NaN or Inf; the camera the job asks for has no
+        frame.
     """
-    job, plan, volume = prepared.job, prepared.plan, prepared.volume
-    warnings = list(plan.warnings)
-    begin = time.perf_counter()
-    density, notes = load_density(
-        volume, plan.density, job.density.nonfinite, lambda d, n: on_stage("reading", d, n)
-    )
-    warnings += notes
-    grids = {plan.density.label: density.nbytes}
-    color: BrickGrid | tuple[float, float, float] = job.color.value
-    if plan.color is not None:
-        color, notes = load_color(
-            volume, plan.color, job.density.nonfinite, lambda d, n: on_stage("reading", d, n)
-        )
-        warnings += notes
-        grids[plan.color.label] = color.nbytes
-    loaded = time.perf_counter()
-
+    plan, density = prepared.plan, loaded.density
     box = np.array([[-1.0] * 3, [1.0] * 3]) if density.is_empty else density.world_box()
+    job = _resolved(prepared.job, make_camera(prepared.job.camera, box))
+    # Made anew from what was chosen, so that the job in the header gives the same rays to the bit.
     camera = make_camera(job.camera, box)
     on_stage("compiling", 0, 1)
     result = render(
-        Scene(density, job.density.scale, color),
+        Scene(density, job.density.scale, loaded.color),
         plan,
         camera,
         threads=threads,
@@ -147,13 +196,12 @@ def run(
         progress=lambda d, n: on_stage("rendering", d, n),
     )
     seconds = {
-        "load": loaded - begin,
+        "load": loaded.seconds,
         "compile": result.compile_seconds,
         "render": result.render_seconds,
     }
-    resolved = _resolved(job, camera)
     writing = time.perf_counter()
-    maps, notes = _write(prepared, result, resolved, seconds, overwrite, on_stage)
+    maps, notes = _write(prepared, result, job, seconds, overwrite, on_stage)
     seconds["write"] = time.perf_counter() - writing
     picture = prepared.files.get("picture")
     return Report(
@@ -169,10 +217,9 @@ def run(
             "mean": float(result.transmittance.mean(dtype=np.float64)),
             "max": float(result.transmittance.max()),
         },
-        camera=resolved.camera.model_dump(mode="json", exclude_none=True),
-        grids=grids,
+        camera=job.camera.model_dump(mode="json", exclude_none=True),
         peak_memory_bytes=peak_memory_bytes(),
-        warnings=warnings + notes,
+        warnings=[*plan.warnings, *loaded.warnings, *notes],
     )
 
 
@@ -183,10 +230,10 @@ def peak_memory_bytes() -> int:
 
 
 def _outputs(job: Job) -> dict[str, Path]:
-    """What the job writes: the picture and, beside it, ``<stem>.<map>.<ext>``."""
+    """What the job writes: the picture and, beside it, ``<stem>.<map>.<ext>``; may be nothing."""
     picture = job.output.image
     if picture is None:
-        raise UsageError("nothing to write: give -o OUT.exr (or output.image in the job)")
+        return {}
     files = {"picture": picture}
     for name in job.output.maps:
         files[name] = picture.with_name(f"{picture.stem}.{name}{picture.suffix}")
@@ -194,15 +241,21 @@ def _outputs(job: Job) -> dict[str, Path]:
 
 
 def _resolved(job: Job, camera: Camera) -> Job:
-    """The job with what was chosen for it filled in, so that it makes the same picture again."""
+    """The job with what was chosen for it filled in, so that it makes the same picture anywhere."""
     chosen: dict[str, Any] = {
         "eye": tuple(camera.eye.tolist()),
         "target": tuple(camera.target.tolist()),
     }
-    if not camera.perspective:
+    if not camera.perspective and job.camera.width is None:
         width, height = camera.resolution
         chosen["width"] = 2 * camera.half_height * width / height
-    return job.model_copy(update={"camera": job.camera.model_copy(update=chosen)})
+    parts: dict[str, Any] = {"camera": job.camera.model_copy(update=chosen)}
+    for part, name in (("density", "file"), ("background", "image"), ("output", "image")):
+        table = getattr(job, part)
+        path = getattr(table, name)
+        if path is not None:
+            parts[part] = table.model_copy(update={name: path.absolute()})
+    return job.model_copy(update=parts)
 
 
 def _write(
@@ -215,8 +268,8 @@ def _write(
 ) -> tuple[dict[str, dict[str, Any]], list[str]]:
     """Write the picture and the maps; returns what was written of maps, and warnings."""
     header: dict[str, str | int | float] = {
-        "Software": f"volcli {__version__}",
-        "volcli:version": __version__,
+        "Software": f"volcli {volcli.__version__}",
+        "volcli:version": volcli.__version__,
         "volcli:rule": prepared.plan.rule,
         "volcli:job": job_as_toml(resolved),
         **{f"volcli:seconds_{name}": float(value) for name, value in seconds.items()},

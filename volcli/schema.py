@@ -62,7 +62,7 @@ class Color(_Part):
     @model_validator(mode="after")
     def _one_source(self) -> Color:
         if self.constant is not None and self.grid is not None:
-            raise ValueError("constant and grid exclude each other; give one")
+            raise ValueError("color.constant and color.grid exclude each other; give one")
         return self
 
     @property
@@ -100,7 +100,7 @@ class Camera(_Part):
     @model_validator(mode="after")
     def _width_is_orthographic(self) -> Camera:
         if self.width is not None and self.type != "orthographic":
-            raise ValueError('width is for type = "orthographic"')
+            raise ValueError('camera.width is for camera.type = "orthographic"')
         return self
 
 
@@ -120,7 +120,7 @@ class Quadrature(_Part):
     @model_validator(mode="after")
     def _step_is_midpoint(self) -> Quadrature:
         if self.step is not None and self.rule != "midpoint":
-            raise ValueError('step is for rule = "midpoint"')
+            raise ValueError('quadrature.step is for quadrature.rule = "midpoint"')
         return self
 
     @property
@@ -140,7 +140,7 @@ class Background(_Part):
     @model_validator(mode="after")
     def _one_background(self) -> Background:
         if self.color is not None and self.image is not None:
-            raise ValueError("color and image exclude each other; give one")
+            raise ValueError("background.color and background.image exclude each other; give one")
         return self
 
 

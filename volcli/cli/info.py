@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from volcli.cli.options import option
-from volcli.cli.table import table
+from volcli.cli.table import in_bytes, say, table, terminal_width
 
 
 def info(
@@ -22,34 +22,64 @@ def info(
     ] = "volcli",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """List the grids of a volume: types, transforms, boxes; with --stats, what their values are.
+    """List the grids of a volume.
 
-    Without --stats only headers are read, and counts and boxes are what the file declares.
+    Types, transforms and boxes; with --stats, what their values are. Without --stats only headers are read, and counts and boxes are what the file declares.
     """
+    from volcli.config import make_job
     from volcli.describe import describe
 
+    make_job({}, [("density.reader", reader)], spelled={"density.reader": f"--reader {reader}"})
     found = describe(volume, stats=stats, reader=reader)
     if as_json:
-        print(json.dumps(found))
+        say(json.dumps(found, allow_nan=False))
         return
-    print(f"{found['file']}  {found['format']}")
-    head = ["grid", "type", "class", "voxels", "box (index)", "voxel size", "transform", "stored"]
-    keys = ["grid", "type", "class", "voxels", "box", "voxel_size", "transform", "stored"]
-    if stats:
-        head += ["min", "mean", "max", "tiles", "NaN/Inf", "below 0", "memory"]
-        keys += ["min", "mean", "max", "tiles", "nonfinite", "negative", "memory_bytes"]
-    print(table(head, [[_cell(grid.get(key)) for key in keys] for grid in found["grids"]]))
-    for grid in found["grids"]:
+    grids = found["grids"]
+    say(f"{found['file']}  {found['format']}{'' if grids else ', holds no grids'}")
+    columns = [*_HEADERS, *(_STATS if stats else [])]
+    if grids:
+        rows = [[_cell(grid.get(key), key) for _, key in columns] for grid in grids]
+        say(table([title for title, _ in columns], rows, terminal_width()))
+    for grid in grids:
         if grid["refusal"]:
-            print(f"{grid['grid']}: cannot be rendered: {grid['refusal']}")
+            say(f"{grid['grid']}: cannot be rendered: {grid['refusal']}")
 
 
-def _cell(value: Any) -> str:
+_HEADERS = [
+    ("grid", "grid"),
+    ("type", "type"),
+    ("class", "class"),
+    ("voxels", "voxels"),
+    ("voxel size", "voxel_size"),
+    ("box (world)", "world_box"),
+    ("box (index)", "box"),
+    ("transform", "transform"),
+    ("stored as", "stored"),
+]
+_STATS = [
+    ("min", "min"),
+    ("mean", "mean"),
+    ("max", "max"),
+    ("leaves", "leaves"),
+    ("tiles", "tiles"),
+    ("NaN/Inf", "nonfinite"),
+    ("below 0", "negative"),
+    ("memory", "memory_bytes"),
+]
+
+
+def _cell(value: Any, key: str) -> str:
     if value is None or value == "":
         return "-"
+    if key == "memory_bytes":
+        return in_bytes(value)
+    if key == "voxel_size" and len({f"{v:.6g}" for v in value}) == 1:
+        return f"{value[0]:.6g}"
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list):
         joint = " .. " if value and isinstance(value[0], list) else ","
-        return joint.join(_cell(v) for v in value)
+        return joint.join(f"{v:.4g}" if isinstance(v, float) else _cell(v, "") for v in value)
+    if isinstance(value, int):
+        return f"{value:,}" if key else str(value)
     return str(value)

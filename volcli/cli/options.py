@@ -15,11 +15,14 @@ def option(key: str, *flags: str, metavar: str | None = None) -> Any:
     """The option that sets a field of the job: its help and default come from the schema."""
     text, default = field(key)
     if default not in (None, ()):
+        # In the text, because typer puts a default that it is told in parentheses.
         text = f"{text} [default: {_written(default)}]"
     return typer.Option(*flags, metavar=metavar, help=text)
 
 
 def _written(default: Any) -> str:
+    if isinstance(default, float):
+        return f"{default:g}"
     if not isinstance(default, tuple):
         return str(default)
     joint = "x" if all(isinstance(v, int) for v in default) else ","
@@ -41,7 +44,9 @@ def numbers(flag: str, text: str | None, count: int = 3) -> tuple[float, ...] | 
     except ValueError:
         values = ()
     if len(values) != count or not all(math.isfinite(v) for v in values):
-        raise UsageError(f"{flag} {text}: give {count} numbers separated by commas, such as 0,1,0")
+        raise UsageError(
+            f"{flag} {text}: give {count} finite numbers separated by commas, such as 0,1,0"
+        )
     return values
 
 
@@ -63,6 +68,13 @@ def size(text: str | None) -> tuple[int, int] | None:
     if min(pixels) < 1:
         raise UsageError(f"--size {text}: give width and height in pixels, such as 1280x720")
     return pixels
+
+
+def names(text: str | None) -> list[str] | None:
+    """``A,B`` to a list; None stays None, and nothing is no names."""
+    if text is None:
+        return None
+    return [part.strip() for part in text.split(",") if part.strip()]
 
 
 def background(text: str | None) -> list[tuple[str, Any]]:

@@ -6,12 +6,10 @@ import sys
 from types import TracebackType
 from typing import Any
 
-_LABELS = {
-    "reading": ("reading", "leaves"),
-    "compiling": ("compiling kernels (first run)", "kernels"),
-    "rendering": ("rendering", "tiles"),
-    "writing": ("writing", "files"),
-}
+_UNITS = {"reading": "leaves", "rendering": "tiles", "writing": "files"}
+_COMPILING = "compiling"
+_WAIT_SECONDS = 0.2
+"""A stage that is over sooner shows no bar."""
 
 
 class Bars:
@@ -26,14 +24,9 @@ class Bars:
         if self._silent:
             return
         if stage != self._stage:
-            from tqdm import tqdm
-
             self.close()
-            label, unit = _LABELS[stage]
             self._stage = stage
-            self._bar = tqdm(
-                desc=label, unit=f" {unit}", total=total, leave=False, delay=0.2, file=sys.stderr
-            )
+            self._bar = _open(stage, total)
         self._bar.update(done - self._bar.n)
         if done >= total:
             self.close()
@@ -54,3 +47,15 @@ class Bars:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def _open(stage: str, total: int) -> Any:
+    from tqdm import tqdm
+
+    if stage == _COMPILING:  # one step that cannot be counted: say it before it starts
+        text = "preparing kernels (the first time they are compiled: about 10 s)"
+        return tqdm(desc=text, total=total, leave=False, bar_format="{desc}", file=sys.stderr)
+    unit = _UNITS[stage.partition(" ")[0]]
+    return tqdm(
+        desc=stage, unit=f" {unit}", total=total, leave=False, delay=_WAIT_SECONDS, file=sys.stderr
+    )

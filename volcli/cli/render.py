@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from volcli.cli.options import background as parse_background
-from volcli.cli.options import numbers, option, size
+from volcli.cli.options import names, numbers, option, size
 from volcli.cli.progress import Bars
-from volcli.cli.table import in_bytes, table
+from volcli.cli.table import in_bytes, say, table, terminal_width
 from volcli.errors import UsageError
+
+if TYPE_CHECKING:
+    from volcli.plan import Plan
+    from volcli.run import Report
 
 
 def render(
@@ -43,7 +48,8 @@ def render(
         str | None,
         typer.Option(
             metavar="transparent|R,G,B|IMAGE",
-            help="What is behind the volume: nothing, a linear colour, or an image file.",
+            help="What is behind the volume: nothing, a linear colour, or an image file. "
+            "[default: transparent]",
         ),
     ] = None,
     maps: Annotated[str | None, option("output.maps", "--maps", metavar="NAME,...")] = None,
@@ -53,7 +59,12 @@ def render(
     ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Any field of the job; repeatable."),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Any field of the job, such as density.nonfinite=zero; repeatable. No VALUE: the "
+            "default.",
+        ),
     ] = None,
     threads: Annotated[
         int | None,
@@ -61,72 +72,115 @@ def render(
     ] = None,
     overwrite: Annotated[bool, typer.Option(help="Whether files that exist are replaced.")] = True,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Print what is evaluated and why, and render.")
+        bool,
+        typer.Option(
+            "--explain",
+            help="Print what is read and evaluated, and why. Without -o, do no more than that.",
+        ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="No progress and no notes, only warnings.")
     ] = False,
 ) -> None:
-    """Render a picture of a volume, with its opacity, transmittance and depth.
+    """Render a picture of a volume.
 
-    Flags win over a job file, which wins over defaults. Without a camera the volume is framed.
+    An EXR also holds its opacity, transmittance, optical depth and depth. Flags win over a job file, which wins over defaults. Without a camera the volume is framed.
     """
-    given: list[tuple[str, Any]] = [
-        ("output.image", output),
-        ("density.grid", grid),
-        ("density.scale", density_scale),
-        ("color.constant", numbers("--color", color)),
-        ("color.grid", color_grid),
-        ("camera.eye", numbers("--eye", eye)),
-        ("camera.target", numbers("--target", target)),
-        ("camera.up", numbers("--up", up)),
-        ("camera.fov", fov),
-        ("camera.type", None if ortho is None else "orthographic"),
-        ("camera.width", ortho),
-        ("camera.resolution", size(image_size)),
-        ("quadrature.rule", None if step is None else "midpoint"),
-        ("quadrature.step", step),
-        ("density.interpolation", interpolation),
-        ("output.maps", None if maps is None else [m.strip() for m in maps.split(",")]),
-        ("output.bits", bits),
-        ("density.reader", reader),
-    ]
-    from volcli.config import load_job
-    from volcli.run import prepare, run
-
     if color is not None and color_grid is not None:
         raise UsageError("--color and --color-grid exclude each other; give one")
+    if fov is not None and ortho is not None:
+        raise UsageError("--fov and --ortho exclude each other; give one")
+    lens = "perspective" if fov is not None else "orthographic" if ortho is not None else None
+    flags: list[tuple[str, str, Any, Any]] = [
+        ("output.image", "-o", output, output),
+        ("density.grid", "--grid", grid, grid),
+        ("density.scale", "--density-scale", density_scale, density_scale),
+        ("color.constant", "--color", color, numbers("--color", color)),
+        ("color.grid", "--color-grid", color_grid, color_grid),
+        ("camera.eye", "--eye", eye, numbers("--eye", eye)),
+        ("camera.target", "--target", target, numbers("--target", target)),
+        ("camera.up", "--up", up, numbers("--up", up)),
+        ("camera.type", "--fov or --ortho", lens, lens),
+        ("camera.fov", "--fov", fov, fov),
+        ("camera.width", "--ortho", ortho, ortho),
+        ("camera.resolution", "--size", image_size, size(image_size)),
+        ("quadrature.rule", "--step", step, None if step is None else "midpoint"),
+        ("quadrature.step", "--step", step, step),
+        ("density.interpolation", "--interpolation", interpolation, interpolation),
+        ("output.maps", "--maps", maps, names(maps)),
+        ("output.bits", "--bits", bits, bits),
+        ("density.reader", "--reader", reader, reader),
+    ]
+    behind = parse_background(background)
+    spelled = {key: f"{flag} {_typed(text)}" for key, flag, text, _ in flags if text is not None}
+    spelled |= {key: f"--background {background}" for key, _ in behind}
+    from volcli.config import load_job
+    from volcli.run import load, prepare, run
+
     job = load_job(
         source,
-        flags=[*((k, v) for k, v in given if v is not None), *parse_background(background)],
+        flags=[*((key, value) for key, _, _, value in flags if value is not None), *behind],
         settings=settings or [],
+        spelled=spelled,
     )
-    prepared = prepare(job, overwrite=overwrite)
+    prepared = prepare(job, overwrite=overwrite, writes=not explain)
     with Bars(quiet) as bars:
-        report = run(prepared, threads=threads, overwrite=overwrite, on_stage=bars)
+        loaded = load(prepared, bars)
+        held = {prepared.plan.density.label: loaded.density.nbytes}
+        if prepared.plan.color is not None and not isinstance(loaded.color, tuple):
+            held[prepared.plan.color.label] = loaded.color.nbytes
+        if explain and not as_json:
+            say(_explained(prepared.plan, held))
+        if not prepared.files:
+            _warn([*prepared.plan.warnings, *loaded.warnings])
+            if as_json:
+                say(json.dumps({"plan": _plan(prepared.plan, held)}, allow_nan=False))
+            return
+        if explain and not as_json:
+            say()
+        report = run(prepared, loaded, threads=threads, overwrite=overwrite, on_stage=bars)
 
-    for warning in report.warnings:
-        print(f"volcli: {warning}", file=sys.stderr)
+    _warn(report.warnings)
+    if not quiet and not as_json and None in (job.camera.eye, job.camera.target):
+        print(f"volcli: camera chosen: {_camera_flags(report.camera)}", file=sys.stderr)
     if as_json:
         printed = asdict(report)
+        del printed["camera"]
         if explain:
-            printed["plan"] = [asdict(term) for term in prepared.plan.terms]
-        print(json.dumps(printed))
-        return
-    if job.camera.eye is None and not quiet:
-        print(f"volcli: camera chosen: {_camera_flags(report.camera)}", file=sys.stderr)
-    if explain:
-        rows = [
-            (t.name, "yes" if t.wanted else "no", t.grid or "-", _held(report.grids, t.grid), t.why)
-            for t in prepared.plan.terms
-        ]
-        print(table(("term", "in", "grid", "memory", "why"), rows), end="\n\n")
-    _print_summary(report)
+            printed["plan"] = _plan(prepared.plan, held)
+        say(json.dumps(printed, allow_nan=False))
+    else:
+        say(_summary(report))
 
 
-def _held(grids: dict[str, int], grid: str | None) -> str:
-    return in_bytes(grids[grid]) if grid in grids else "-"
+def _typed(value: Any) -> str:
+    """A value about as it was typed: 0 rather than 0.0."""
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _warn(warnings: Sequence[str]) -> None:
+    for warning in warnings:
+        print(f"volcli: {warning}", file=sys.stderr)
+
+
+def _plan(plan: Plan, held: dict[str, int]) -> list[dict[str, Any]]:
+    """The terms of a plan with the bytes that their grids hold, as plain data."""
+    return [{**asdict(t), "memory_bytes": held.get(t.grid, 0) if t.grid else 0} for t in plan.terms]
+
+
+def _explained(plan: Plan, held: dict[str, int]) -> str:
+    rows = [
+        (
+            t.name,
+            "yes" if t.wanted else "no",
+            t.grid or "-",
+            in_bytes(held[t.grid]) if t.grid in held else "-",
+            t.why,
+        )
+        for t in plan.terms
+    ]
+    return table(("term", "in", "grid", "memory", "why"), rows, terminal_width())
 
 
 def _camera_flags(camera: dict[str, Any]) -> str:
@@ -136,21 +190,21 @@ def _camera_flags(camera: dict[str, Any]) -> str:
     return f"--eye {eye} --target {target} {lens}"
 
 
-def _print_summary(report: Any) -> None:
+def _summary(report: Report) -> str:
     width, height = report.size
-    if report.image is not None:
-        print(f"{report.image}  picture {width}x{height}")
+    lines = [f"{report.image}  picture {width}x{height}"]
     for name, written in report.maps.items():
         scale = ""
         if (written["black"], written["white"]) != (0.0, 1.0):
             scale = f", black is {written['black']:g}, white is {written['white']:g}"
-        print(f"{written['file']}  {name}{scale}")
+        lines.append(f"{written['file']}  {name}{scale}")
     t, s = report.transmittance, report.seconds
-    print(
+    lines.append(
         f"{report.rule}: {report.rays:,} rays, {report.cells:,} evaluations; transmittance "
         f"{t['min']:.4g} to {t['max']:.4g}, mean {t['mean']:.4g}"
     )
-    print(
+    lines.append(
         f"load {s['load']:.2f} s, compile {s['compile']:.2f} s, render {s['render']:.2f} s, "
         f"write {s['write']:.2f} s; peak memory {in_bytes(report.peak_memory_bytes)}"
     )
+    return "\n".join(lines)

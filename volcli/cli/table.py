@@ -1,17 +1,51 @@
-"""Plain tables for the terminal: columns lined up, nothing drawn."""
+"""What commands print to stdout: plain tables, columns lined up, nothing drawn."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import sys
 from collections.abc import Sequence
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Rows of text under a heading, each column as wide as its widest cell."""
+def say(text: str = "") -> None:
+    """Print to stdout at once, so that it keeps its place among the lines on stderr.
+
+    A reader that has gone away (``| head -1``) is not an error: the rest goes nowhere.
+    """
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+
+
+def terminal_width() -> int:
+    """Columns to print in: the terminal's; 100 where output goes to a file or a pipe."""
+    return max(40, shutil.get_terminal_size((100, 24)).columns)
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]], width: int | None = None) -> str:
+    """Rows of text under a heading, each column as wide as its widest cell.
+
+    Parameters
+    ----------
+    width
+        Where the columns do not fit, those that are left over follow as a further table, which
+        repeats the first column. None: they always fit.
+    """
     lines = [list(head), *[list(row) for row in rows]]
     widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
-        for line in lines
+    groups: list[list[int]] = [[0]]
+    for column in range(1, len(head)):
+        taken = sum(widths[i] + 2 for i in groups[-1])
+        if width is not None and len(groups[-1]) > 1 and taken + widths[column] > width:
+            groups.append([0])
+        groups[-1].append(column)
+    return "\n\n".join(
+        "\n".join("  ".join(line[i].ljust(widths[i]) for i in group).rstrip() for line in lines)
+        for group in groups
     )
 
 

@@ -1,0 +1,84 @@
+"""The commands as one application, and what becomes of an error: one line and an exit code."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import typer
+
+from volcli.cli import info, render
+from volcli.errors import VolcliError
+
+_ParserError: Any = typer.BadParameter.__mro__[2]
+"""What the parser of the command line raises; typer has it under no name of its own."""
+
+app = typer.Typer(
+    name="volcli",
+    help="Render OpenVDB and other grid volumes to images, with opacity right to rounding.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # importing rich takes longer than all the rest of --help
+)
+app.command(name="render")(render.render)
+app.command(name="info")(info.info)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from volcli import __version__
+
+        typer.echo(f"volcli {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: bool = typer.Option(
+        False,
+        "--version",
+        callback=_show_version,
+        is_eager=True,
+        help="Print the version and exit.",
+    ),
+) -> None:
+    pass
+
+
+def run_app(arguments: Sequence[str]) -> int:
+    """Run one command; returns the exit code. Errors that are foreseen print one line to stderr.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If the user interrupts, where the parser does not turn it into exit code 130 itself.
+    """
+    try:
+        code = app(list(arguments) or ["--help"], prog_name="volcli", standalone_mode=False)
+    except VolcliError as error:
+        return _fail(str(error), error.exit_code)
+    except _ParserError as error:
+        return _fail(_usage(error), 2)
+    except MemoryError as error:
+        return _fail(f"out of memory ({error}); a smaller picture (--size) takes less", 1)
+    except typer.Abort as error:
+        raise KeyboardInterrupt from error
+    if code == 130:
+        raise KeyboardInterrupt
+    if not arguments:
+        return 2
+    return code if isinstance(code, int) else 0
+
+
+def _fail(message: str, code: int) -> int:
+    print(f"volcli: {' '.join(message.split())}", file=sys.stderr)
+    return code
+
+
+def _usage(error: Any) -> str:
+    """What the parser has to say, and where help is."""
+    said = error.format_message().rstrip(".").removeprefix("Invalid value for ")
+    said = said.replace("': Input should be", ": must be").removeprefix("'")
+    path = error.ctx.command_path if getattr(error, "ctx", None) else "volcli"
+    return f"{said}; see {path} --help"
