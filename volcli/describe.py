@@ -57,7 +57,7 @@ def _headers(header: GridHeader) -> dict[str, Any]:
         "voxel_size": size,
         "transform": header.map_type,
         "world_from_index": None if matrix is None else matrix.tolist(),
-        "background": np.asarray(header.background).tolist(),
+        "background": _plain(header.background),
         "stored": header.stored,
         "refusal": header.refusal,
     }
@@ -80,13 +80,21 @@ def _stats(volume: Volume, header: GridHeader) -> dict[str, Any]:
         "tiles": len(tree.tile_origins),
         "box": box,
         "world_box": None if box is None else grid.world_box().tolist(),
-        "min": float(finite.min()) if finite.size else None,
-        "max": float(finite.max()) if finite.size else None,
+        "min": float(finite.min()) + 0.0 if finite.size else None,  # 0 rather than -0
+        "max": float(finite.max()) + 0.0 if finite.size else None,
         "mean": _mean(voxels, tiles, weights),
         "nonfinite": _count_nonfinite(tree),
         "negative": int(np.count_nonzero(values < 0)),
         "memory_bytes": grid.nbytes,
     }
+
+
+def _plain(value: Any) -> Any:
+    """A value or a vector as JSON can hold it: None where it is not known, or NaN or Inf."""
+    if value is None:
+        return None
+    plain = np.asarray(value)
+    return plain.tolist() if np.isfinite(plain).all() else None
 
 
 def _mean(

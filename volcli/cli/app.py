@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -64,6 +65,11 @@ def run_app(arguments: Sequence[str]) -> int:
         return _fail(f"out of memory ({error}); a smaller picture (--size) takes less", 1)
     except typer.Abort as error:
         raise KeyboardInterrupt from error
+    except Exception as error:
+        if os.environ.get("VOLCLI_DEBUG"):
+            raise
+        what = f"unexpected {type(error).__name__}: {error}"
+        return _fail(f"{what}; VOLCLI_DEBUG=1 shows where: please report it", 1)
     if code == 130:
         raise KeyboardInterrupt
     if not arguments:

@@ -24,7 +24,8 @@ def info(
 ) -> None:
     """List the grids of a volume.
 
-    Types, transforms and boxes; with --stats, what their values are. Without --stats only headers are read, and counts and boxes are what the file declares.
+    Types, transforms and boxes; with --stats, what their values are. Without --stats only headers
+    are read, and counts and boxes are what the file declares.
     """
     from volcli.config import make_job
     from volcli.describe import describe
@@ -36,36 +37,55 @@ def info(
         return
     grids = found["grids"]
     say(f"{found['file']}  {found['format']}{'' if grids else ', holds no grids'}")
-    columns = [*_HEADERS, *(_STATS if stats else [])]
     if grids:
-        rows = [[_cell(grid.get(key), key) for _, key in columns] for grid in grids]
-        say(table([title for title, _ in columns], rows, terminal_width()))
+        say(_tables(grids, _GROUPS if stats else _GROUPS[:-1]))
     for grid in grids:
         if grid["refusal"]:
             say(f"{grid['grid']}: cannot be rendered: {grid['refusal']}")
 
 
-_HEADERS = [
-    ("grid", "grid"),
-    ("type", "type"),
-    ("class", "class"),
-    ("voxels", "voxels"),
-    ("voxel size", "voxel_size"),
-    ("box (world)", "world_box"),
-    ("box (index)", "box"),
-    ("transform", "transform"),
-    ("stored as", "stored"),
+_Columns = list[tuple[str, str]]
+
+_GROUPS: list[_Columns] = [
+    [
+        ("type", "type"),
+        ("class", "class"),
+        ("voxels", "voxels"),
+        ("voxel size", "voxel_size"),
+        ("box (world)", "world_box"),
+    ],
+    [
+        ("box (index)", "box"),
+        ("transform", "transform"),
+        ("stored as", "stored"),
+    ],
+    [
+        ("min", "min"),
+        ("mean", "mean"),
+        ("max", "max"),
+        ("leaves", "leaves"),
+        ("tiles", "tiles"),
+        ("NaN/Inf", "nonfinite"),
+        ("below 0", "negative"),
+        ("memory", "memory_bytes"),
+    ],
 ]
-_STATS = [
-    ("min", "min"),
-    ("mean", "mean"),
-    ("max", "max"),
-    ("leaves", "leaves"),
-    ("tiles", "tiles"),
-    ("NaN/Inf", "nonfinite"),
-    ("below 0", "negative"),
-    ("memory", "memory_bytes"),
-]
+"""Headings and keys, the most useful first; the last group is of --stats."""
+
+
+def _tables(grids: list[dict[str, Any]], groups: list[_Columns]) -> str:
+    """One table where the terminal is wide enough for it, else one for each group of columns."""
+    width = terminal_width()
+    whole = _table(grids, [column for group in groups for column in group], None)
+    if max(map(len, whole.splitlines())) <= width:
+        return whole
+    return "\n\n".join(_table(grids, group, width) for group in groups)
+
+
+def _table(grids: list[dict[str, Any]], columns: _Columns, width: int | None) -> str:
+    columns = [("grid", "grid"), *columns]
+    rows = [[_cell(grid.get(key), key) for _, key in columns] for grid in grids]
+    return table([title for title, _ in columns], rows, width)
 
 
 def _cell(value: Any, key: str) -> str:

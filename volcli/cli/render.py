@@ -85,7 +85,8 @@ def render(
 ) -> None:
     """Render a picture of a volume.
 
-    An EXR also holds its opacity, transmittance, optical depth and depth. Flags win over a job file, which wins over defaults. Without a camera the volume is framed.
+    An EXR also holds its opacity, transmittance, optical depth and depth. Flags win over a job
+    file, which wins over defaults. Without a camera the volume is framed.
     """
     if color is not None and color_grid is not None:
         raise UsageError("--color and --color-grid exclude each other; give one")

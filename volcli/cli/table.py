@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
+import unicodedata
 from collections.abc import Sequence
 
 
@@ -36,7 +37,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], width: int | None 
         repeats the first column. None: they always fit.
     """
     lines = [list(head), *[list(row) for row in rows]]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
+    widths = [max(_columns(line[i]) for line in lines) for i in range(len(head))]
     groups: list[list[int]] = [[0]]
     for column in range(1, len(head)):
         taken = sum(widths[i] + 2 for i in groups[-1])
@@ -44,9 +45,17 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], width: int | None 
             groups.append([0])
         groups[-1].append(column)
     return "\n\n".join(
-        "\n".join("  ".join(line[i].ljust(widths[i]) for i in group).rstrip() for line in lines)
+        "\n".join(
+            "  ".join(line[i] + " " * (widths[i] - _columns(line[i])) for i in group).rstrip()
+            for line in lines
+        )
         for group in groups
     )
+
+
+def _columns(text: str) -> int:
+    """How many columns of a terminal a text takes: wide characters of East Asia take two."""
+    return sum(1 + (unicodedata.east_asian_width(c) in "WF") for c in text)
 
 
 def in_bytes(count: int) -> str:

@@ -31,6 +31,9 @@ __all__ = [
 DENSITY = "density"
 """The name by which a file says which of its grids is the density."""
 
+LEVEL_SET = "level set"
+"""The class of grids that hold distances to a surface."""
+
 
 def open_volume(path: Path, reader: str = "volcli") -> Volume:
     """Open a volume file: header and metadata only.
@@ -90,26 +93,33 @@ def density_grid(volume: Volume, name: str | None) -> tuple[GridHeader, list[str
         header = _named(volume, name or DENSITY, "scalar", notes)
     else:
         scalars = [h for h in volume.headers if not h.is_vector and h.refusal is None]
-        if len(scalars) != 1:
+        if len(volume.headers) == 1 or len(scalars) == 1:
+            header = scalars[0] if scalars else volume.headers[0]
+            notes.append(f"{volume.path}: no grid named 'density'; rendering '{header.label}'")
+        elif scalars:
             raise VolumeError(
-                f"{volume.path}: no grid named 'density', and "
-                + (f"{len(scalars)} scalar grids" if scalars else "no scalar grid that can be read")
-                + f"; it has: {_listed(volume)}"
-                + ("; choose one with --grid" if scalars else "")
+                f"{volume.path}: no grid named 'density', and {len(scalars)} scalar grids; choose "
+                f"one with --grid; it has: {_listed(volume)}"
             )
-        header = scalars[0]
-        notes.append(f"{volume.path.name}: no grid named 'density'; rendering '{header.label}'")
+        else:
+            raise VolumeError(f"{volume.path}: no scalar grid to render; it has: {_listed(volume)}")
     _must_read(volume, header)
+    others = [h for h in volume.headers if _may_be_density(h) and h is not header]
+    instead = (
+        f"choose another with --grid: {', '.join(h.label for h in others)}"
+        if others
+        else "give a volume with a fog density"
+    )
     if header.is_vector:
         raise VolumeError(
-            f"{volume.path}: grid '{header.label}' is {header.value_type}; a density is a scalar. "
-            f"It has: {_listed(volume)}"
+            f"{volume.path}: grid '{header.label}' is {header.value_type}, and a density is a "
+            f"scalar; {instead}"
         )
-    if header.grid_class == "level set":
+    if header.grid_class == LEVEL_SET:
         raise VolumeError(
-            f"{volume.path}: grid '{header.label}' is a level set (distances to a surface), not "
-            f"fog; convert it with OpenVDB's sdfToFogVolume or Houdini's Convert VDB, or choose "
-            f"another with --grid (it has: {_listed(volume)})"
+            f"{volume.path}: grid '{header.label}' is a level set (distances to a surface), not a "
+            f"fog volume; convert it with OpenVDB's sdfToFogVolume or Houdini's Convert VDB, or "
+            f"{instead}"
         )
     return header, notes
 
@@ -126,9 +136,15 @@ def color_grid(volume: Volume, name: str) -> tuple[GridHeader, list[str]]:
     header = _named(volume, name, "vec3", notes)
     _must_read(volume, header)
     if not header.is_vector:
+        vectors = [h.label for h in volume.headers if h.is_vector and h.refusal is None]
+        instead = (
+            f"choose another with --color-grid: {', '.join(vectors)}"
+            if vectors
+            else "there is none in the file; give one colour with --color R,G,B"
+        )
         raise VolumeError(
-            f"{volume.path}: grid '{header.label}' is {header.value_type}; a colour grid is vec3. "
-            f"It has: {_listed(volume)}"
+            f"{volume.path}: grid '{header.label}' is {header.value_type}, and a colour is vec3; "
+            f"{instead}"
         )
     return header, notes
 
@@ -180,25 +196,34 @@ def _named(volume: Volume, name: str, kind: str, notes: list[str]) -> GridHeader
     if same:
         others = ", ".join(h.label for h in same[1:])
         notes.append(
-            f"{volume.path.name}: {len(same)} grids are named '{name}'; taking '{same[0].label}' "
+            f"{volume.path}: {len(same)} grids are named '{name}'; taking '{same[0].label}' "
             f"(there is also {others})"
         )
         return same[0]
-    close = difflib.get_close_matches(name, [h.label for h in volume.headers], n=1, cutoff=0.5)
-    meant = f"; did you mean '{close[0]}'?" if close else ""
+    fit = [h for h in volume.headers if h.is_vector == (kind == "vec3") and h.refusal is None]
+    labels = {h.label.lower(): h.label for h in fit}
+    close = difflib.get_close_matches(name.lower(), labels, n=1, cutoff=0.5)
+    meant = f"; did you mean '{labels[close[0]]}'?" if close else ""
     raise VolumeError(f"{volume.path}: no {kind} grid '{name}'; it has: {_listed(volume)}{meant}")
 
 
 def _must_read(volume: Volume, header: GridHeader) -> None:
     if header.refusal is not None:
+        others = [h.label for h in volume.headers if h.refusal is None]
+        instead = f"the file also has: {', '.join(others)}" if others else "give another volume"
         raise VolumeError(
-            f"{volume.path}: grid '{header.label}' cannot be rendered: {header.refusal}; "
-            f"it has: {_listed(volume)}"
+            f"{volume.path}: grid '{header.label}' cannot be rendered: {header.refusal}; {instead}"
         )
 
 
+def _may_be_density(header: GridHeader) -> bool:
+    return not header.is_vector and header.refusal is None and header.grid_class != LEVEL_SET
+
+
 def _listed(volume: Volume) -> str:
-    return ", ".join(f"{h.label} ({h.value_type})" for h in volume.headers) or "no grids"
+    return ", ".join(f"{h.label} ({h.refusal or h.value_type})" for h in volume.headers) or (
+        "no grids"
+    )
 
 
 def _nearby(path: Path) -> str:
