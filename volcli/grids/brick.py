@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -95,16 +96,12 @@ class BrickGrid:
     active_box
         (2, 3) int64, index space: the smallest and largest lattice point that is active or differs
         from the background; ``lo > hi`` when there is none.
-    brick_min, brick_max
-        (n,) or (n, 3) float32: the range of the values of each brick, apron included.
     """
 
     arrays: BrickArrays
     origin: NDArray[np.int64]
     world_from_index: NDArray[np.float64]
     active_box: NDArray[np.int64]
-    brick_min: NDArray[np.float32]
-    brick_max: NDArray[np.float32]
 
     @property
     def is_empty(self) -> bool:
@@ -119,7 +116,13 @@ class BrickGrid:
     @property
     def nbytes(self) -> int:
         """Bytes held."""
-        return sum(a.nbytes for a in (*self.arrays, self.brick_min, self.brick_max))
+        return sum(array.nbytes for array in self.arrays)
+
+    @cached_property
+    def brick_range(self) -> NDArray[np.float32]:
+        """(2, n) or (2, n, 3): the smallest and largest value of each brick, apron included."""
+        atlas = self.arrays.atlas
+        return np.array([atlas.min(axis=1), atlas.max(axis=1)])
 
     @property
     def local_from_world(self) -> NDArray[np.float64]:
@@ -192,8 +195,6 @@ def build(tree: Tree, header: GridHeader) -> BrickGrid:
         origin=first * ROOT_WIDTH,
         world_from_index=np.asarray(header.world_from_index, np.float64),
         active_box=active_box,
-        brick_min=atlas.min(axis=1) if len(atlas) else atlas[:, 0],
-        brick_max=atlas.max(axis=1) if len(atlas) else atlas[:, 0],
     )
 
 
@@ -214,32 +215,48 @@ def _constants(tree: Tree) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
 
 def _active_box(tree: Tree) -> NDArray[np.int64]:
     """Smallest and largest lattice point that is active or differs from the background."""
-    vector = tree.leaf_values.ndim == 5
-    boxes = []
-    if len(tree.leaf_origins):
-        differs = tree.leaf_values != tree.background
-        if vector:
-            differs = differs.any(axis=-1)
-        active = np.unpackbits(tree.leaf_masks, axis=1, bitorder="little").astype(bool)
-        used = differs | active.reshape(differs.shape)
-        origins = tree.leaf_origins.astype(np.int64)
-        for axis in range(3):
-            others = tuple(a for a in (1, 2, 3) if a != axis + 1)
-            lines = used.any(axis=others)  # (n, 8)
-            leaf, at = np.nonzero(lines)
-            where = origins[leaf, axis] + at
-            boxes.append((where.min(), where.max()) if len(where) else (1, 0))
-        leaves = np.array(boxes, np.int64).T
-    else:
-        leaves = np.array([[1, 1, 1], [0, 0, 0]], np.int64)
-    if not len(tree.tile_origins):
-        return leaves
-    lo = tree.tile_origins.astype(np.int64)
-    hi = lo + tree.tile_widths.astype(np.int64)[:, None] - 1
-    tiles = np.array([lo.min(axis=0), hi.max(axis=0)])
-    if (leaves[0] > leaves[1]).any():
-        return tiles
-    return np.array([np.minimum(leaves[0], tiles[0]), np.maximum(leaves[1], tiles[1])])
+    boxes = [np.array([[1, 1, 1], [0, 0, 0]], np.int64)]
+    if len(tree.tile_origins):
+        lo = tree.tile_origins.astype(np.int64)
+        hi = lo + tree.tile_widths.astype(np.int64)[:, None] - 1
+        boxes.append(np.array([lo.min(axis=0), hi.max(axis=0)]))
+    ends = [[_outermost(tree, axis, side) for axis in range(3)] for side in (0, 1)]
+    if ends[0][0] is not None:
+        boxes.append(np.array(ends, np.int64))
+    if len(boxes) == 1:
+        return boxes[0]
+    found = np.array(boxes[1:])
+    return np.array([found[:, 0].min(axis=0), found[:, 1].max(axis=0)])
+
+
+def _outermost(tree: Tree, axis: int, side: int) -> int | None:
+    """The first (side 0) or last (side 1) lattice point along an axis that a leaf uses.
+
+    Looks at the outermost leaves alone, and further in only while those use nothing.
+    """
+    along = tree.leaf_origins[:, axis]
+    layers = np.unique(along)
+    for origin in layers if side == 0 else layers[::-1]:
+        used = np.flatnonzero(_used(tree, along == origin).any(axis=(0, *_others(axis))))
+        if len(used):
+            return int(origin) + int(used[0 if side == 0 else -1])
+    return None
+
+
+def _others(axis: int) -> tuple[int, int]:
+    """The axes of (n, x, y, z) that are neither n nor this one."""
+    a, b = (other + 1 for other in range(3) if other != axis)
+    return a, b
+
+
+def _used(tree: Tree, leaves: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(n, 8, 8, 8): which lattice points of some leaves are active, or not background."""
+    values = tree.leaf_values[leaves]
+    differs = values != tree.background
+    if values.ndim == 5:
+        differs = differs.any(axis=-1)
+    active = np.unpackbits(tree.leaf_masks[leaves], axis=1, bitorder="little").astype(bool)
+    return differs | active.reshape(differs.shape)
 
 
 class _SourceTables:

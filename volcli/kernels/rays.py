@@ -140,14 +140,12 @@ def integrate_rays(
         while t < t_far and inside(grid, at):
             t_exit, axis = root_exit(grid, ray, at)
             t_exit = min(t_exit, t_far)
-            segments = 0
+            buffer.count[0] = 0
             if t_exit > t:
                 entry, corner = root_cell(grid, at)
-                segments = root_segments(
-                    grid, skip_background, entry, corner, ray, t, t_exit, buffer
-                )
+                root_segments(grid, skip_background, entry, corner, ray, t, t_exit, buffer)
                 t = t_exit
-            for s in range(segments):
+            for s in range(buffer.count[0]):
                 t0, t1 = buffer.times[s, 0], buffer.times[s, 1]
                 entry = int(buffer.entries[s])
                 corner = (buffer.corners[s, 0], buffer.corners[s, 1], buffer.corners[s, 2])

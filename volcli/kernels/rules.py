@@ -19,7 +19,7 @@ from volcli.kernels.source import (
     colour_cell,
     darken,
 )
-from volcli.kernels.traversal import advance, brick_entry, start
+from volcli.kernels.traversal import advance, brick_entry, start_all
 
 
 @jit
@@ -29,9 +29,7 @@ def exact_brick(state, grid, scale, brick, corner, ray, t0, t1, colour, nearest,
     With ``nearest`` a cell has one value.
     """
     x, y, z = corner
-    i, tx, ddx, sx = start(ray, 0, t0, x, 1, 8)
-    j, ty, ddy, sy = start(ray, 1, t0, y, 1, 8)
-    k, tz, ddz, sz = start(ray, 2, t0, z, 1, 8)
+    i, j, k, tx, ty, tz, sx, sy, sz, ddx, ddy, ddz = start_all(ray, t0, x, y, z, 1.0, 8.0)
     dx, dy, dz = ray.d
     lit = (colour is not None or depth is not None) and state.tau <= STOP_TAU
     colour_entry, cx, cy, cz = 0, 0, 0, 0

@@ -54,6 +54,8 @@ class Segments(NamedTuple):
 
     Attributes
     ----------
+    count
+        (1,) int64: how many there are.
     times
         (SEGMENTS, 2) float64: from and to where.
     entries
@@ -62,6 +64,7 @@ class Segments(NamedTuple):
         (SEGMENTS, 3) int64: the lowest local voxel of the brick, block or root cell.
     """
 
+    count: NDArray[np.int64]
     times: NDArray[np.float64]
     entries: NDArray[np.int32]
     corners: NDArray[np.int64]
@@ -70,6 +73,7 @@ class Segments(NamedTuple):
 def segment_buffer() -> Segments:
     """An empty `Segments`."""
     return Segments(
+        np.zeros(1, np.int64),
         np.empty((SEGMENTS, 2), np.float64),
         np.empty(SEGMENTS, np.int32),
         np.empty((SEGMENTS, 3), np.int64),
@@ -103,19 +107,29 @@ def make_ray(o, d):
 
 
 @jit
-def start(ray, axis, t, lo, width, count):
+def start(o, d, inverse, t, lo, width, count):
     """Enter a row of ``count`` cells of ``width`` that begins at ``lo``, at distance t.
 
-    Returns (cell, t of the next plane, t between planes, step) along one axis.
+    Takes one axis of a `Ray`. Returns (cell, t of the next plane, t between planes, step). Width
+    and count are floats: numba compiles a function anew for each constant integer it is given.
     """
-    o, d, inverse = ray.o[axis], ray.d[axis], ray.inverse[axis]
-    cell = math.floor((o + t * d - lo) * (1.0 / width))
-    cell = min(max(cell, 0), count - 1)
+    cell = math.floor((o + t * d - lo) / width)
+    cell = min(max(cell, 0), int(count) - 1)
     if d > 0.0:
         return cell, (lo + (cell + 1) * width - o) * inverse, width * inverse, 1
     if d < 0.0:
         return cell, (lo + cell * width - o) * inverse, -width * inverse, -1
     return cell, math.inf, math.inf, 0
+
+
+@jit
+def start_all(ray, t, x, y, z, width, count):
+    """`start` along the three axes of a cube of cells whose lowest voxel is (x, y, z)."""
+    o, d, inverse = ray
+    i, tx, ddx, sx = start(o[0], d[0], inverse[0], t, float(x), width, count)
+    j, ty, ddy, sy = start(o[1], d[1], inverse[1], t, float(y), width, count)
+    k, tz, ddz, sz = start(o[2], d[2], inverse[2], t, float(z), width, count)
+    return i, j, k, tx, ty, tz, sx, sy, sz, ddx, ddy, ddz
 
 
 @jit
@@ -263,22 +277,16 @@ def root_segments(grid, skip_background, entry, corner, ray, t0, t1, buffer):
     ray
         `Ray`.
     buffer
-        `Segments`, written.
-
-    Returns
-    -------
-    The number of segments written.
+        `Segments`, to which the segments are added.
     """
     x, y, z = corner
     if entry < 0:
         if skip_background and entry == BACKGROUND:
-            return 0
-        return put(buffer, 0, t0, t1, entry, x, y, z)
+            return
+        put(buffer, t0, t1, entry, x, y, z)
+        return
     upper = grid.upper
-    i, tx, ddx, sx = start(ray, 0, t0, x, BLOCK, 32)
-    j, ty, ddy, sy = start(ray, 1, t0, y, BLOCK, 32)
-    k, tz, ddz, sz = start(ray, 2, t0, z, BLOCK, 32)
-    n = 0
+    i, j, k, tx, ty, tz, sx, sy, sz, ddx, ddy, ddz = start_all(ray, t0, x, y, z, float(BLOCK), 32.0)
     t = t0
     while True:
         t_exit = min(min(tx, ty), min(tz, t1))
@@ -286,71 +294,66 @@ def root_segments(grid, skip_background, entry, corner, ray, t0, t1, buffer):
         if t_exit > t and not (skip_background and e == BACKGROUND):
             bx, by, bz = x + i * BLOCK, y + j * BLOCK, z + k * BLOCK
             if e >= 0:
-                n = block_segments(grid, skip_background, e, bx, by, bz, ray, t, t_exit, buffer, n)
+                block_segments(grid, skip_background, e, bx, by, bz, ray, t, t_exit, buffer)
             else:
-                n = put(buffer, n, t, t_exit, e, bx, by, bz)
+                put(buffer, t, t_exit, e, bx, by, bz)
         t = max(t, t_exit)
         if t_exit >= t1:
-            return n
+            return
         i, j, k, tx, ty, tz = advance(i, j, k, tx, ty, tz, sx, sy, sz, ddx, ddy, ddz)
         if (i | j | k) & ~31:
-            return n
+            return
 
 
 @jit
-def block_segments(grid, skip_background, entry, x, y, z, ray, t0, t1, buffer, n):
+def block_segments(grid, skip_background, entry, x, y, z, ray, t0, t1, buffer):
     """As `root_segments`, for the occupied macro cells of the block with lowest voxel (x, y, z)."""
     occupied = grid.occupied
-    i, tx, ddx, sx = start(ray, 0, t0, x, MACRO, 4)
-    j, ty, ddy, sy = start(ray, 1, t0, y, MACRO, 4)
-    k, tz, ddz, sz = start(ray, 2, t0, z, MACRO, 4)
+    i, j, k, tx, ty, tz, sx, sy, sz, ddx, ddy, ddz = start_all(ray, t0, x, y, z, float(MACRO), 4.0)
     t = t0
     while True:
         t_exit = min(min(tx, ty), min(tz, t1))
         if t_exit > t and (occupied[entry, (i * 4 + j) * 4 + k] or not skip_background):
-            n = macro_segments(
-                grid, skip_background, entry, i, j, k, x, y, z, ray, t, t_exit, buffer, n
-            )
+            macro_segments(grid, skip_background, entry, i, j, k, x, y, z, ray, t, t_exit, buffer)
         t = max(t, t_exit)
         if t_exit >= t1:
-            return n
+            return
         i, j, k, tx, ty, tz = advance(i, j, k, tx, ty, tz, sx, sy, sz, ddx, ddy, ddz)
         if (i | j | k) & ~3:
-            return n
+            return
 
 
 @jit
-def macro_segments(grid, skip_background, entry, mi, mj, mk, x, y, z, ray, t0, t1, buffer, n):
+def macro_segments(grid, skip_background, entry, mi, mj, mk, x, y, z, ray, t0, t1, buffer):
     """As `root_segments`, for the bricks of macro cell (mi, mj, mk) of the block at (x, y, z)."""
     lower = grid.lower
     first = (mi * 64 + mj * 4) * 16 + mk * 4
     x += mi * MACRO
     y += mj * MACRO
     z += mk * MACRO
-    i, tx, ddx, sx = start(ray, 0, t0, x, BRICK, 4)
-    j, ty, ddy, sy = start(ray, 1, t0, y, BRICK, 4)
-    k, tz, ddz, sz = start(ray, 2, t0, z, BRICK, 4)
+    i, j, k, tx, ty, tz, sx, sy, sz, ddx, ddy, ddz = start_all(ray, t0, x, y, z, float(BRICK), 4.0)
     t = t0
     while True:
         t_exit = min(min(tx, ty), min(tz, t1))
         e = int(lower[entry, first + (i * 16 + j) * 16 + k])
         if t_exit > t and not (skip_background and e == BACKGROUND):
-            n = put(buffer, n, t, t_exit, e, x + i * BRICK, y + j * BRICK, z + k * BRICK)
+            put(buffer, t, t_exit, e, x + i * BRICK, y + j * BRICK, z + k * BRICK)
         t = max(t, t_exit)
         if t_exit >= t1:
-            return n
+            return
         i, j, k, tx, ty, tz = advance(i, j, k, tx, ty, tz, sx, sy, sz, ddx, ddy, ddz)
         if (i | j | k) & ~3:
-            return n
+            return
 
 
 @jit
-def put(buffer, n, t0, t1, entry, x, y, z):
-    """Write segment n; returns n + 1."""
+def put(buffer, t0, t1, entry, x, y, z):
+    """Write one more segment."""
+    n = buffer.count[0]
+    buffer.count[0] = n + 1
     buffer.times[n, 0] = t0
     buffer.times[n, 1] = t1
     buffer.entries[n] = entry
     buffer.corners[n, 0] = x
     buffer.corners[n, 1] = y
     buffer.corners[n, 2] = z
-    return n + 1

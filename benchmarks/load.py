@@ -1,0 +1,105 @@
+"""Time and memory to a renderable grid, against OpenVDB reading the same file into an array.
+
+    python -m benchmarks.load [VOLUME.vdb ...]
+
+Each run is a process of its own that times itself: for volcli, reading a tree and building its
+bricks; for OpenVDB's Python module, reading the grid and copying its active box to a NumPy array.
+Rounds are interleaved and ratios taken round by round.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common import make_cloud, summary, write_results
+from volcli.grids.pyopenvdb import find_interpreter
+
+ROUNDS = 7
+
+OURS = """
+import json, resource, sys, time
+from pathlib import Path
+from volcli.grids import density_grid, load_density, open_volume
+base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+begin = time.perf_counter()
+volume = open_volume(Path(sys.argv[1]))
+grid, _ = load_density(volume, density_grid(volume, None)[0], "error")
+seconds = time.perf_counter() - begin
+peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+print(json.dumps({"seconds": seconds, "peak": peak, "before": base, "held": grid.nbytes}))
+"""
+
+THEIRS = """
+import json, resource, sys, time
+import numpy as np
+try:
+    import openvdb as vdb
+except ImportError:
+    import pyopenvdb as vdb
+begin = time.perf_counter()
+grid = vdb.read(sys.argv[1], "density")
+low, high = grid.evalActiveVoxelBoundingBox()
+array = np.empty([h - l + 1 for l, h in zip(low, high)], np.float32)
+grid.copyToArray(array, ijk=low)
+seconds = time.perf_counter() - begin
+peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+print(json.dumps({"seconds": seconds, "peak": peak, "voxels": int(grid.activeVoxelCount())}))
+"""
+
+
+def run(command: list[str], env: dict[str, str] | None = None) -> dict[str, Any]:
+    """One process that prints one JSON object."""
+    done = subprocess.run(command, check=True, capture_output=True, text=True, env=env)
+    return json.loads(done.stdout)
+
+
+def compare(path: Path) -> dict[str, Any]:
+    """Both loaders on one file."""
+    clean = {"PATH": os.environ.get("PATH", "")}
+    ours, theirs = [], []
+    for _ in range(ROUNDS):
+        ours.append(run([sys.executable, "-c", OURS, str(path)]))
+        theirs.append(run([find_interpreter(), "-I", "-c", THEIRS, str(path)], clean))
+    ratios = [a["seconds"] / b["seconds"] for a, b in zip(ours, theirs, strict=True)]
+    return {
+        "voxels": theirs[0]["voxels"],
+        "volcli": {
+            "seconds": summary([r["seconds"] for r in ours]),
+            "peak_bytes": max(r["peak"] for r in ours),
+            "held_bytes": ours[0]["held"],
+        },
+        "openvdb": {
+            "seconds": summary([r["seconds"] for r in theirs]),
+            "peak_bytes": max(r["peak"] for r in theirs),
+        },
+        "volcli_over_openvdb": summary(ratios),
+    }
+
+
+def main(arguments: list[str]) -> None:
+    """Compare on the files named, or on a cloud made for it."""
+    results = {}
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(a) for a in arguments]
+        if not paths:
+            paths = [make_cloud(Path(folder) / "cloud_384.vdb", 384, 0.44)]
+        for path in paths:
+            row = results[path.name] = compare(path)
+            ours, theirs = row["volcli"], row["openvdb"]
+            print(
+                f"{path.name}: {row['voxels']:,} voxels; volcli {ours['seconds']['median']:.3f} s, "
+                f"openvdb {theirs['seconds']['median']:.3f} s, ratio "
+                f"{row['volcli_over_openvdb']['median']:.2f}; peak memory "
+                f"{ours['peak_bytes'] / 1e6:.0f} MB for {ours['held_bytes'] / 1e6:.0f} MB of bricks"
+            )
+    write_results("load", results)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
