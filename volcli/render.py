@@ -117,7 +117,7 @@ def render(
     constant = np.array(scene.color) if isinstance(scene.color, tuple) else None
 
     begin = time.perf_counter()
-    integrate = _integrator(scene, plan)
+    integrate = make_integrator(scene, plan)
     nothing = np.empty((0, 3))
     integrate(nothing, nothing)  # compiles
     compiled = time.perf_counter()
@@ -180,7 +180,7 @@ def over(result: RenderResult, background: Floats | None) -> Floats:
     return np.dstack([result.radiance, result.opacity]) + behind
 
 
-def _integrator(
+def make_integrator(
     scene: Scene, plan: Plan
 ) -> Callable[[NDArray[Any], NDArray[Any]], tuple[Any, ...]]:
     """A function of (origins, directions) to (tau, radiance, distance, evaluations)."""
