@@ -63,6 +63,8 @@ def run_app(arguments: Sequence[str]) -> int:
         return _fail(_usage(error), 2)
     except MemoryError as error:
         return _fail(f"out of memory ({error}); a smaller picture (--size) takes less", 1)
+    except SystemExit:  # what the parser makes of a reader of its help that has gone away
+        return 0
     except typer.Abort as error:
         raise KeyboardInterrupt from error
     except Exception as error:
