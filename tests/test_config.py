@@ -1,0 +1,177 @@
+"""Job files and settings to jobs: every field, in every way that it can be written."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+import tomli_w
+from hypothesis import given
+from hypothesis import strategies as st
+
+from volcli.config import job_as_toml, load_job, make_job, parse_setting
+from volcli.errors import UsageError
+from volcli.schema import MAPS, Job, field
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+positive = st.floats(min_value=1e-300, allow_infinity=False)
+light = st.floats(min_value=0, allow_infinity=False)
+vectors = st.lists(finite, min_size=3, max_size=3)
+colours = st.lists(light, min_size=3, max_size=3)
+# What TOML can hold; a path of no letters is the folder, which is nothing to write to.
+texts = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=12)
+paths = texts.map(lambda text: str(Path(text)))
+pixels = st.integers(1, 65536)
+
+FIELDS = {
+    "density.file": paths,
+    "density.grid": texts,
+    "density.scale": positive,
+    "density.interpolation": st.sampled_from(["linear", "nearest"]),
+    "density.nonfinite": st.sampled_from(["error", "zero"]),
+    "density.reader": st.sampled_from(["volcli", "openvdb"]),
+    "color.constant": colours,
+    "color.grid": texts,
+    "camera.type": st.sampled_from(["perspective", "orthographic"]),
+    "camera.eye": vectors,
+    "camera.target": vectors,
+    "camera.up": vectors.filter(any),
+    "camera.fov": st.floats(0, 180, exclude_min=True, exclude_max=True),
+    "camera.width": positive,
+    "camera.resolution": st.lists(pixels, min_size=2, max_size=2),
+    "quadrature.rule": st.sampled_from(["exact", "midpoint"]),
+    "quadrature.step": positive,
+    "background.color": colours,
+    "background.image": paths,
+    "output.image": paths,
+    "output.maps": st.lists(st.sampled_from(MAPS), max_size=4),
+    "output.bits": st.sampled_from([8, 16]),
+}
+
+NEEDS = {
+    "camera.width": ("camera.type", "orthographic"),
+    "quadrature.step": ("quadrature.rule", "midpoint"),
+}
+EXCLUDES = [("color.constant", "color.grid"), ("background.color", "background.image")]
+
+
+@st.composite
+def settings_of_a_job(draw):
+    """Some fields with values that go together."""
+    chosen = draw(st.sets(st.sampled_from(sorted(FIELDS))))
+    for one, other in EXCLUDES:
+        if {one, other} <= chosen:
+            chosen.remove(draw(st.sampled_from([one, other])))
+    settings = {key: draw(FIELDS[key]) for key in sorted(chosen)}
+    for key, (other, value) in NEEDS.items():
+        if key in settings:
+            settings[other] = value
+    return settings
+
+
+def plain(job, key):
+    part, name = key.split(".")
+    return job.model_dump(mode="json")[part][name]
+
+
+def test_every_field_is_tried():
+    known = {
+        f"{part}.{n}" for part, i in Job.model_fields.items() for n in i.annotation.model_fields
+    }
+    assert set(FIELDS) == known
+
+
+@given(settings_of_a_job())
+def test_a_job_written_as_toml_reads_back_as_the_same_job(settings):
+    job = make_job({}, list(settings.items()))
+    for key, value in settings.items():
+        assert plain(job, key) == value
+    assert make_job(tomllib.loads(job_as_toml(job))) == job
+
+
+@given(settings_of_a_job(), settings_of_a_job())
+def test_a_setting_wins_over_the_file_and_the_file_over_the_default(written, settings):
+    file = {}
+    for key, value in written.items():
+        part, name = key.split(".")
+        file.setdefault(part, {})[name] = value
+    for key, (other, value) in NEEDS.items():  # what the settings leave without its companion
+        if key in written and settings.get(other, value) != value:
+            settings.pop(other)
+    job = make_job(file, list(settings.items()))
+    dropped = {b for a, b in EXCLUDES if a in settings} | {a for a, b in EXCLUDES if b in settings}
+    for key in FIELDS:
+        if key in settings:
+            assert plain(job, key) == settings[key]
+        elif key in written and key not in dropped:
+            assert plain(job, key) == written[key]
+        else:
+            assert plain(job, key) == plain(Job(), key)
+
+
+@given(st.data())
+def test_a_setting_is_written_as_in_a_job_file(data):
+    key = data.draw(st.sampled_from(sorted(FIELDS)))
+    value = data.draw(FIELDS[key])
+    text = tomli_w.dumps({"v": value}, multiline_strings=False).removeprefix("v = ").strip()
+    assert parse_setting(f"{key}={text}") == (key, value)
+    assert parse_setting(f" {key} = {text}") == (key, value)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("density.grid=smoke", ("density.grid", "smoke")),
+        ("density.grid='3'", ("density.grid", "3")),
+        ("density.scale=2", ("density.scale", 2)),
+        ("density.file=a=b.vdb", ("density.file", "a=b.vdb")),
+        ("camera.eye=", ("camera.eye", None)),
+    ],
+)
+def test_a_setting_that_is_no_toml_is_text(text, expected):
+    assert parse_setting(text) == expected
+
+
+@pytest.mark.parametrize("text", ["", "=", "scale=2", "density.=", "a.b.c=1", ".x=1", "a.b"])
+def test_a_setting_without_a_field_is_refused(text):
+    with pytest.raises(UsageError):
+        make_job({}, [parse_setting(text)])
+
+
+@given(st.text(max_size=30))
+def test_any_text_is_a_setting_or_a_usage_error_of_one_line(text):
+    try:
+        make_job({}, [parse_setting(text)])
+    except UsageError as error:
+        assert str(error)
+
+
+@given(st.sampled_from(sorted(FIELDS)), st.one_of(
+    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5),
+    st.lists(st.one_of(st.integers(), st.text(max_size=3), st.floats()), max_size=4),
+    st.dictionaries(st.text(max_size=3), st.integers(), max_size=2),
+))  # fmt: skip
+def test_a_value_of_any_type_is_taken_or_refused_by_the_name_of_its_field(key, value):
+    part, name = key.split(".")
+    try:
+        make_job({part: {name: value}}, source="a.toml")
+    except UsageError as error:
+        assert str(error).startswith((f"a.toml: {key}: ", f"a.toml: {key} is for"))
+        assert "must be" in str(error) or "is for" in str(error) or "must not be" in str(error)
+
+
+def test_a_volume_is_its_own_job(tmp_path):
+    job = load_job(tmp_path / "smoke.vdb")
+    assert job == make_job({"density": {"file": tmp_path / "smoke.vdb"}})
+
+
+def test_the_command_line_wins_in_the_order_setting_flag_file(tmp_path):
+    path = tmp_path / "job.toml"
+    path.write_text("[density]\nfile = 'a.vdb'\nscale = 1.5\n")
+    assert load_job(path).density.scale == 1.5
+    assert load_job(path, [("density.scale", 2.5)]).density.scale == 2.5
+    assert load_job(path, [("density.scale", 2.5)], ["density.scale=3.5"]).density.scale == 3.5
+
+
+def test_a_field_that_is_unknown_has_no_help():
+    with pytest.raises(KeyError):
+        field("density.colour")
