@@ -6,6 +6,8 @@ import re
 import numpy as np
 import pytest
 from commandline import SAMPLES, VOLUMES, volcli, write_ball, write_grid
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from volcli.images import read_exr
 
@@ -247,3 +249,25 @@ def test_memory_that_is_not_there_is_said_in_one_line(monkeypatch, tmp_path):
     ran = volcli("render", SAMPLES / "rotated.vdb", "-o", tmp_path / "a.exr")
     assert ran.code == 1
     assert "out of memory (Unable to allocate 8 TiB); a smaller picture" in ran.err
+
+
+@settings(max_examples=150)
+@given(st.data())
+def test_a_damaged_array_file_is_refused_or_read_but_never_a_defect(arrays, data):
+    suffix = data.draw(st.sampled_from([".npy", ".npz"]))
+    whole = bytearray((arrays / f"whole{suffix}").read_bytes())
+    for _ in range(data.draw(st.integers(0, 4))):
+        whole[data.draw(st.integers(0, len(whole) - 1))] = data.draw(st.integers(0, 255))
+    path = arrays / f"damaged{suffix}"
+    path.write_bytes(whole[: data.draw(st.integers(0, len(whole)))])
+    ran = volcli("info", path, "--stats")
+    assert ran.code in (0, 3), ran.err
+
+
+@pytest.fixture(scope="module")
+def arrays(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("arrays")
+    values = np.random.default_rng(1).random((5, 6, 7), np.float32)
+    np.save(folder / "whole.npy", values)
+    np.savez_compressed(folder / "whole.npz", density=values, voxel_size=0.5)
+    return folder

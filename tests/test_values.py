@@ -1,5 +1,7 @@
 """Values that cannot be rendered as they are: found, counted, located, and settled as asked."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import tree_of
@@ -29,10 +31,11 @@ def test_a_value_that_is_not_finite_becomes_0_where_that_is_accepted(bad):
 
 
 def test_a_double_beyond_float32_is_not_finite():
-    values = np.ones((8, 8, 8), np.float64)
-    values[1, 2, 3] = 1e200
-    with pytest.raises(VolumeError, match=r"\(1, 2, 3\)"):
-        settle_nonfinite(tree_of(values), "f", "error")
+    values = np.ones((1, 8, 8, 8), np.float64)
+    values[0, 1, 2, 3] = 1e200
+    tree = replace(tree_of(values[0] > 0), leaf_values=values)
+    with pytest.raises(VolumeError, match=r"1 values.*\(1, 2, 3\)"):
+        settle_nonfinite(tree, "f", "error")
 
 
 def test_values_that_are_sound_are_left_as_they_are():

@@ -8,7 +8,10 @@ the first lattice point), which hold for all of them. Arrays are indexed [x, y, 
 
 from __future__ import annotations
 
+import struct
+import tokenize
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +24,20 @@ from volcli.grids.tree import LEAF_WIDTH, GridHeader, Progress, Tree
 
 _PLACEMENT = ("voxel_size", "origin")
 _MAX_HEADER = 1 << 16
+
+_DAMAGE = (
+    OSError,
+    ValueError,
+    KeyError,
+    EOFError,
+    SyntaxError,
+    RuntimeError,  # encrypted; NotImplementedError, a method of compression
+    struct.error,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What NumPy, zipfile and zlib raise on a file that is damaged."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +63,7 @@ def open_dense(path: Path) -> DenseVolume:
         If the file is damaged, holds no array, or its voxel size or origin make no sense.
     """
     try:
-        if path.suffix == ".npy":
+        if _is_npy(path):
             with path.open("rb") as file:
                 shapes = {"density": _array_header(file)}
             world = np.eye(4)
@@ -60,8 +77,8 @@ def open_dense(path: Path) -> DenseVolume:
                             shapes[name] = _array_header(file)
                 placed = {name: _load(path, name) for name in _PLACEMENT if name in names}
             world = _placement(path, placed)
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise VolumeError(f"{path}: not a readable NumPy file: {error}") from error
+    except _DAMAGE as error:
+        raise VolumeError(f"{path}: not a readable NumPy file: {_reason(error)}") from error
     if not shapes:
         raise VolumeError(f"{path}: holds no array")
     return DenseVolume(path, tuple(_header(n, s, d, world) for n, (s, d) in shapes.items()))
@@ -128,10 +145,18 @@ def _array_header(file: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 def _load(path: Path, name: str) -> NDArray[Any]:
     try:
-        loaded = np.load(path, allow_pickle=False, mmap_mode="r" if path.suffix == ".npy" else None)
-        return loaded if path.suffix == ".npy" else loaded[name]
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise VolumeError(f"{path}: array '{name}' cannot be read: {error}") from error
+        loaded = np.load(path, allow_pickle=False, mmap_mode="r" if _is_npy(path) else None)
+        return loaded if _is_npy(path) else loaded[name]
+    except _DAMAGE as error:
+        raise VolumeError(f"{path}: array '{name}' cannot be read: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    return str(error).strip().split("\n")[0] or "it ends too early"
+
+
+def _is_npy(path: Path) -> bool:
+    return path.suffix.lower() == ".npy"
 
 
 def _placement(path: Path, placed: dict[str, NDArray[Any]]) -> NDArray[np.float64]:
