@@ -20,6 +20,7 @@ import pytest
 
 from volcli import images
 from volcli.errors import NonFiniteError, OutputError, UsageError
+from volcli.images import store
 
 JOB = '[density]\nfile = "smöke.vdb"\ngrid = "density"\n' + "# 0123456789\n" * 5000
 
@@ -768,7 +769,7 @@ def test_a_file_that_appears_while_writing_is_not_overwritten_either(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool
 ) -> None:
     path = tmp_path / "a.exr"
-    monkeypatch.setattr(images, "_sync", lambda file: path.write_text("faster"))
+    monkeypatch.setattr(store, "_sync", lambda file: path.write_text("faster"))
     if not links:
 
         def refuse(*_: object) -> None:
@@ -829,7 +830,7 @@ def test_a_file_that_does_not_read_back_as_written_never_gets_its_name(
 ) -> None:
     path = tmp_path / name
     path.write_text("old")
-    encode = images._encode
+    encode = store._encode
 
     def damaged(file: Path, *rest: Any) -> None:
         encode(file, *rest)
@@ -838,7 +839,7 @@ def test_a_file_that_does_not_read_back_as_written_never_gets_its_name(
             data[len(data) // 2 + 20_000] ^= 0xFF
         file.write_bytes({"cut": data[:-5000], "flipped": data, "empty": bytearray()}[damage])
 
-    monkeypatch.setattr(images, "_encode", damaged)
+    monkeypatch.setattr(store, "_encode", damaged)
     with pytest.raises(OutputError, match=name):
         write_noise(path)
     assert path.read_text() == "old"
@@ -849,7 +850,7 @@ def test_a_file_that_does_not_read_back_as_written_never_gets_its_name(
 def test_a_sound_file_with_one_other_pixel_never_gets_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    encode = images._encode
+    encode = store._encode
 
     def altered(
         file: Path, file_format: str, names: list[str], pixels: np.ndarray, *rest: Any
@@ -858,7 +859,7 @@ def test_a_sound_file_with_one_other_pixel_never_gets_its_name(
         pixels[-1, -1, 0] += 1
         encode(file, file_format, names, pixels, *rest)
 
-    monkeypatch.setattr(images, "_encode", altered)
+    monkeypatch.setattr(store, "_encode", altered)
     with pytest.raises(OutputError, match="read back with other pixels"):
         write_noise(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
@@ -875,7 +876,7 @@ def test_a_failure_at_any_step_leaves_the_old_file_and_nothing_else(
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(images, step, fail)
+    monkeypatch.setattr(store, step, fail)
     expected = OutputError if isinstance(error, OSError) else KeyboardInterrupt
     with pytest.raises(expected) as caught:
         write_noise(path)

@@ -1,0 +1,75 @@
+"""Image files to arrays as they are stored: an EXR's channels and header, any image's pixels.
+
+No value is changed here; making colour of them is for `background`.
+"""
+
+import os
+import stat
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from volcli.errors import UsageError
+from volcli.images.library import Failed, one_line, open_image, reason_of
+from volcli.images.paths import mode_of
+from volcli.images.store import Attribute
+
+if TYPE_CHECKING:
+    import OpenImageIO as oiio
+
+
+def read_exr(
+    path: str | os.PathLike[str],
+) -> tuple[dict[str, NDArray[np.float32]], dict[str, Attribute]]:
+    """Read the channels and the header of an EXR (the first part of a multi-part file).
+
+    Returns
+    -------
+    channels : dict
+        Name -> (height, width) float32: the file's data window.
+    attributes : dict
+        The header's strings, ints and floats.
+
+    Raises
+    ------
+    UsageError
+        The file is missing, is no EXR, is deep or is damaged.
+    """
+    path = Path(path)
+    pixels, spec, file_format = read_stored(path)
+    if file_format != "openexr":
+        raise UsageError(f"{path}: is {file_format}, not EXR; name an .exr that volcli wrote")
+    # Copies, so that a caller that keeps one channel does not keep them all.
+    channels = {name: pixels[..., i].copy() for i, name in enumerate(spec.channelnames)}
+    attributes = {
+        a.name: a.value for a in spec.extra_attribs if isinstance(a.value, str | int | float)
+    }
+    return channels, attributes
+
+
+def read_stored(path: Path) -> tuple[NDArray[np.float32], "oiio.ImageSpec", str]:
+    """(h, w, c) float32 pixels as stored, their spec, and the format's name."""
+    import OpenImageIO as oiio
+
+    try:
+        mode = mode_of(path)
+        if mode is None:
+            raise UsageError(f"{path}: no such file; check the path")
+        if stat.S_ISDIR(mode):
+            raise UsageError(f"{path}: is a folder; name an image")
+        source = open_image(path)
+    except (OSError, ValueError, Failed) as error:
+        raise UsageError(f"{path}: not a readable image ({reason_of(error)})") from error
+    try:
+        spec = source.spec()
+        if spec.deep:
+            raise UsageError(f"{path}: is a deep image; flatten it first")
+        pixels = source.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
+        message = source.geterror()
+        if pixels is None or message:
+            raise UsageError(f"{path}: damaged image ({one_line(message)})")
+        return pixels.reshape(spec.height, spec.width, spec.nchannels), spec, source.format_name()
+    finally:
+        source.close()
