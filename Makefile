@@ -4,9 +4,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 SETUP := $(VENV)/.installed
 
-.PHONY: demo test lint bench samples clean
+.PHONY: demo test lint bench gallery samples clean
 
 demo: $(SETUP)
+	mkdir -p out
 	$(BIN)/volcli render configs/cloud.toml -o out/cloud.exr
 	$(BIN)/volcli render configs/cloud.toml -o out/cloud.png --maps transmittance
 
@@ -19,8 +20,17 @@ lint: $(SETUP)
 	$(BIN)/mypy
 
 bench: $(SETUP)
-	$(BIN)/python -m benchmarks.render
+	$(BIN)/python -m benchmarks.accuracy
 	$(BIN)/python -m benchmarks.load
+	$(BIN)/python -m benchmarks.render
+
+# The README's pictures.
+gallery: $(SETUP)
+	mkdir -p docs/gallery
+	$(BIN)/volcli render configs/cloud.toml -o docs/gallery/cloud.png --size 960x540 --maps transmittance
+	$(BIN)/volcli render configs/explosion.toml -o docs/gallery/explosion.png --size 480x480 --set output.maps=[]
+	$(BIN)/volcli render configs/colored_smoke.toml -o docs/gallery/colored_smoke.png --size 336x480 --set output.maps=[]
+	$(BIN)/volcli render configs/rotated.toml -o docs/gallery/rotated.png --size 480x480 --set output.maps=[]
 
 # Needs the real OpenVDB library (Debian: apt-get install python3-openvdb).
 samples:

@@ -1,0 +1,82 @@
+"""Every example of the README runs and does what the text says."""
+
+import contextlib
+import io
+import re
+import shlex
+import tomllib
+
+import pytest
+from commandline import ROOT, volcli
+
+from volcli.config import make_job
+from volcli.schema import Job
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language):
+    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+
+
+def commands():
+    """The volcli commands of the shell blocks, lines that end in a backslash joined."""
+    lines = [line for block in blocks("sh") for line in block.replace("\\\n", " ").splitlines()]
+    return [line for line in lines if line.startswith("volcli ")]
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A folder with the samples and configs of the checkout, to stand in."""
+    for folder in ("samples", "configs"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_readme_has_examples():
+    assert len(commands()) >= 7
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("command", commands())
+def test_each_command_of_the_readme_does_what_it_says(command, checkout):
+    words = shlex.split(command)[1:]
+    if words[0] == "render":  # small: what is tested is that it runs, not the picture
+        words += ["--size", "64x48"]
+    ran = volcli(*words)
+    assert ran.code == 0, ran.err
+    if "-o" in words:
+        written = checkout / words[words.index("-o") + 1]
+        assert written.stat().st_size > 0
+    else:
+        assert ran.out
+
+
+def test_the_job_file_of_the_readme_is_a_job_that_names_every_part():
+    (text,) = blocks("toml")
+    tables = tomllib.loads(text)
+    job = make_job(tables, source="README.md")
+    assert set(tables) == set(Job.model_fields)
+    assert job.density.scale == 16.0
+
+
+def test_the_python_of_the_readme_prints_what_its_comment_says():
+    (code,) = blocks("python")
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        exec(compile(code, "README.md", "exec"), {})
+    assert printed.getvalue().strip() == code.rsplit("# ", 1)[1].strip()
+
+
+@pytest.mark.parametrize("picture", re.findall(r"\]\((docs/[^)]+\.png)\)", README))
+def test_each_picture_of_the_readme_is_there(picture):
+    assert (ROOT / picture).read_bytes().startswith(b"\x89PNG")
+
+
+def test_each_make_target_of_the_readme_exists():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    named = set(re.findall(r"`?make (\w+)", README)) - {"a", "it"}
+    assert named
+    for target in named:
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
