@@ -360,3 +360,12 @@ def test_no_arguments_print_the_help_and_are_a_usage_error():
 
 def test_the_version_is_that_of_the_package():
     assert volcli("--version").out == f"volcli {version('volcli')}\n"
+
+
+def test_the_summary_of_a_command_is_the_first_line_of_its_help():
+    from volcli.cli.app import COMMANDS
+
+    for name, summary in COMMANDS.items():
+        assert volcli(name, "--help").out.splitlines()[2].strip() == summary
+        assert f"{name}  " in volcli("--help").out
+        assert summary in volcli("--help").out

@@ -5,25 +5,46 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from typing import Any
 
 import typer
 
-from volcli.cli import info, render
 from volcli.errors import VolcliError
 
 _ParserError: Any = typer.BadParameter.__mro__[2]
 """What the parser of the command line raises; typer has it under no name of its own."""
 
-app = typer.Typer(
-    name="volcli",
-    help="Render OpenVDB and other grid volumes to images, with opacity right to rounding.",
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # importing rich takes longer than all the rest of --help
-)
-app.command(name="render")(render.render)
-app.command(name="info")(info.info)
+COMMANDS = {
+    "render": "Render a picture of a volume.",
+    "info": "List the grids of a volume.",
+}
+"""The commands, each a function of its name in the module of its name, and their summaries."""
+
+
+def build_app(wanted: str | None) -> typer.Typer:
+    """The application with the one command that is wanted; the others are known by name alone.
+
+    So `volcli --help` need not load the schema that the options of a command come from.
+    """
+    app = typer.Typer(
+        name="volcli",
+        help="Render OpenVDB and other grid volumes to images, with opacity right to rounding.",
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,  # importing rich takes longer than all the rest of --help
+    )
+    app.callback()(_root)
+    for name, summary in COMMANDS.items():
+        if name == wanted:
+            app.command(name)(getattr(import_module(f"volcli.cli.{name}"), name))
+        else:
+            app.command(name, help=summary)(_not_loaded)
+    return app
+
+
+def _not_loaded() -> None:
+    raise AssertionError("the command that is called is loaded")
 
 
 def _show_version(wanted: bool) -> None:
@@ -34,7 +55,6 @@ def _show_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
 def _root(
     version: bool = typer.Option(
         False,
@@ -55,7 +75,9 @@ def run_app(arguments: Sequence[str]) -> int:
     KeyboardInterrupt
         If the user interrupts, where the parser does not turn it into exit code 130 itself.
     """
+    wanted = next((a for a in arguments if not a.startswith("-")), None)
     try:
+        app = build_app(wanted)
         code = app(list(arguments) or ["--help"], prog_name="volcli", standalone_mode=False)
     except VolcliError as error:
         return _fail(str(error), error.exit_code)
