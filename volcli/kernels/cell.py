@@ -18,6 +18,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from volcli.kernels.compiler import jit
 
 NODE = math.sqrt(0.6) / 2
@@ -33,17 +35,20 @@ MAX_SPLIT = 1024
 
 @jit
 def load(atlas, brick, i, j, k):
-    """The eight corner values of cell (i, j, k) of a brick, as float64, z fastest."""
+    """The eight corner values of cell (i, j, k) of a brick, as float64, z fastest.
+
+    (Numba's ``float()`` leaves a float32 as it is, and then so does all that is computed from it.)
+    """
     b = (i * 9 + j) * 9 + k
     return (
-        float(atlas[brick, b]),
-        float(atlas[brick, b + 1]),
-        float(atlas[brick, b + 9]),
-        float(atlas[brick, b + 10]),
-        float(atlas[brick, b + 81]),
-        float(atlas[brick, b + 82]),
-        float(atlas[brick, b + 90]),
-        float(atlas[brick, b + 91]),
+        np.float64(atlas[brick, b]),
+        np.float64(atlas[brick, b + 1]),
+        np.float64(atlas[brick, b + 9]),
+        np.float64(atlas[brick, b + 10]),
+        np.float64(atlas[brick, b + 81]),
+        np.float64(atlas[brick, b + 82]),
+        np.float64(atlas[brick, b + 90]),
+        np.float64(atlas[brick, b + 91]),
     )
 
 

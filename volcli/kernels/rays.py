@@ -140,12 +140,12 @@ def integrate_rays(
         while t < t_far and inside(grid, at):
             t_exit, axis = root_exit(grid, ray, at)
             t_exit = min(t_exit, t_far)
-            buffer.count[0] = 0
+            buffer.used[0] = 0
             if t_exit > t:
                 entry, corner = root_cell(grid, at)
                 root_segments(grid, skip_background, entry, corner, ray, t, t_exit, buffer)
                 t = t_exit
-            for s in range(buffer.count[0]):
+            for s in range(buffer.used[0]):
                 t0, t1 = buffer.times[s, 0], buffer.times[s, 1]
                 entry = int(buffer.entries[s])
                 corner = (buffer.corners[s, 0], buffer.corners[s, 1], buffer.corners[s, 2])
@@ -169,7 +169,7 @@ def integrate_rays(
                         colour_ray,
                     )
                 elif entry < 0:
-                    value = float(grid.constants[-1 - entry])
+                    value = np.float64(grid.constants[-1 - entry])
                     state, cells = exact_constant(
                         state,
                         value,

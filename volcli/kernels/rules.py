@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from volcli.kernels.cell import absorbed, cubic, integral, load, trilinear
 from volcli.kernels.compiler import jit
 from volcli.kernels.source import (
@@ -44,7 +46,7 @@ def exact_brick(state, grid, scale, brick, corner, ray, t0, t1, colour, nearest,
             cells += 1
             tm = 0.5 * (t + t_exit)
             if nearest is not None:
-                p = (float(grid.atlas[brick, (i * 9 + j) * 9 + k]), 0.0, 0.0, 0.0)
+                p = (np.float64(grid.atlas[brick, (i * 9 + j) * 9 + k]), 0.0, 0.0, 0.0)
             else:
                 px = ray.o[0] + tm * dx - (x + i)
                 py = ray.o[1] + tm * dy - (y + j)
@@ -88,7 +90,7 @@ def exact_constant(state, density, scale, t0, t1, colour, nearest, depth, colour
 def density_at(grid, entry, corner, ray, t, nearest):
     """The density at distance t, in a brick with lowest voxel ``corner`` or in a constant."""
     if entry < 0:
-        return float(grid.constants[-1 - entry])
+        return np.float64(grid.constants[-1 - entry])
     x = ray.o[0] + t * ray.d[0] - corner[0]
     y = ray.o[1] + t * ray.d[1] - corner[1]
     z = ray.o[2] + t * ray.d[2] - corner[2]
@@ -96,7 +98,7 @@ def density_at(grid, entry, corner, ray, t, nearest):
     j = min(max(math.floor(y), 0), 7)
     k = min(max(math.floor(z), 0), 7)
     if nearest is not None:
-        return float(grid.atlas[entry, (i * 9 + j) * 9 + k])
+        return np.float64(grid.atlas[entry, (i * 9 + j) * 9 + k])
     return max(0.0, trilinear(load(grid.atlas, entry, i, j, k), x - i, y - j, z - k))
 
 

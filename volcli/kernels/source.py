@@ -125,11 +125,19 @@ def colour_at(colour, nearest, cell, ray, t):
     if entry < 0:
         constants = colour.grid.constants
         at = -1 - entry
-        return float(constants[at, 0]), float(constants[at, 1]), float(constants[at, 2])
+        return (
+            np.float64(constants[at, 0]),
+            np.float64(constants[at, 1]),
+            np.float64(constants[at, 2]),
+        )
     atlas = colour.grid.atlas
     b = ((i & 7) * 9 + (j & 7)) * 9 + (k & 7)
     if nearest is not None:
-        return float(atlas[entry, b, 0]), float(atlas[entry, b, 1]), float(atlas[entry, b, 2])
+        return (
+            np.float64(atlas[entry, b, 0]),
+            np.float64(atlas[entry, b, 1]),
+            np.float64(atlas[entry, b, 2]),
+        )
     x = ray.o[0] + t * ray.d[0] - i
     y = ray.o[1] + t * ray.d[1] - j
     z = ray.o[2] + t * ray.d[2] - k
@@ -144,14 +152,14 @@ def colour_at(colour, nearest, cell, ray, t):
 def channel(atlas, brick, b, c, x, y, z):
     """Channel c at (x, y, z) in the cell of a brick whose first corner is value b."""
     v = (
-        float(atlas[brick, b, c]),
-        float(atlas[brick, b + 1, c]),
-        float(atlas[brick, b + 9, c]),
-        float(atlas[brick, b + 10, c]),
-        float(atlas[brick, b + 81, c]),
-        float(atlas[brick, b + 82, c]),
-        float(atlas[brick, b + 90, c]),
-        float(atlas[brick, b + 91, c]),
+        np.float64(atlas[brick, b, c]),
+        np.float64(atlas[brick, b + 1, c]),
+        np.float64(atlas[brick, b + 9, c]),
+        np.float64(atlas[brick, b + 10, c]),
+        np.float64(atlas[brick, b + 81, c]),
+        np.float64(atlas[brick, b + 82, c]),
+        np.float64(atlas[brick, b + 90, c]),
+        np.float64(atlas[brick, b + 91, c]),
     )
     return trilinear(v, x, y, z)
 

@@ -54,8 +54,8 @@ class Segments(NamedTuple):
 
     Attributes
     ----------
-    count
-        (1,) int64: how many there are.
+    used
+        (1,) int64: how many segments there are.
     times
         (SEGMENTS, 2) float64: from and to where.
     entries
@@ -64,7 +64,7 @@ class Segments(NamedTuple):
         (SEGMENTS, 3) int64: the lowest local voxel of the brick, block or root cell.
     """
 
-    count: NDArray[np.int64]
+    used: NDArray[np.int64]
     times: NDArray[np.float64]
     entries: NDArray[np.int32]
     corners: NDArray[np.int64]
@@ -349,8 +349,8 @@ def macro_segments(grid, skip_background, entry, mi, mj, mk, x, y, z, ray, t0, t
 @jit
 def put(buffer, t0, t1, entry, x, y, z):
     """Write one more segment."""
-    n = buffer.count[0]
-    buffer.count[0] = n + 1
+    n = buffer.used[0]
+    buffer.used[0] = n + 1
     buffer.times[n, 0] = t0
     buffer.times[n, 1] = t1
     buffer.entries[n] = entry
