@@ -175,3 +175,11 @@ def test_the_command_line_wins_in_the_order_setting_flag_file(tmp_path):
 def test_a_field_that_is_unknown_has_no_help():
     with pytest.raises(KeyError):
         field("density.colour")
+
+
+@pytest.mark.parametrize("value", [True, "2"])
+@pytest.mark.parametrize("key", ["density.scale", "camera.fov"])
+def test_a_number_is_written_as_one(key, value):
+    with pytest.raises(UsageError, match=f"^a.toml: {key}: must be a number, not "):
+        part, name = key.split(".")
+        make_job({part: {name: value}}, source="a.toml")

@@ -10,18 +10,28 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    Strict,
+    field_validator,
+    model_validator,
+)
 
 Rule = Literal["exact", "midpoint"]
 Interpolation = Literal["linear", "nearest"]
 MapName = Literal["transmittance", "opacity", "optical_depth", "depth"]
 MAPS: tuple[str, ...] = get_args(MapName)
 
-Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-Positive = Annotated[FiniteFloat, Field(gt=0)]
-Radiance = Annotated[FiniteFloat, Field(ge=0)]
+Number = Annotated[FiniteFloat, Strict()]
+"""A number that is written as one: neither true nor a number in quotes."""
+Vector = tuple[Number, Number, Number]
+Positive = Annotated[Number, Field(gt=0)]
+Radiance = Annotated[Number, Field(ge=0)]
 Colour = tuple[Radiance, Radiance, Radiance]
-Pixels = Annotated[int, Field(ge=1, le=65536)]
+Pixels = Annotated[int, Strict(), Field(ge=1, le=65536)]
 
 DEFAULT_STEP = 0.5
 
@@ -80,7 +90,7 @@ class Camera(_Part):
     eye: Vector | None = Field(None, description="Position X,Y,Z in world units.")
     target: Vector | None = Field(None, description="Point X,Y,Z looked at, in world units.")
     up: Vector = Field((0.0, 1.0, 0.0), description="Direction X,Y,Z that is up in the picture.")
-    fov: Annotated[FiniteFloat, Field(gt=0, lt=180)] = Field(
+    fov: Annotated[Number, Field(gt=0, lt=180)] = Field(
         40.0, description="Vertical field of view of a perspective camera, in degrees."
     )
     width: Positive | None = Field(
