@@ -17,8 +17,6 @@ INNER = np.polynomial.legendre.leggauss(4)  # exact for the integral of a cubic
 MAX_TAU = 0.25
 """Intervals are split until each has a smaller optical depth; 8 nodes then leave 1e-16."""
 
-MAX_PARTS = 100_000
-
 Lookup = Callable[[np.ndarray], np.ndarray]
 
 
@@ -151,18 +149,23 @@ def trace(origin, direction, density: Lattice, scale=1.0, colour: Lattice | None
     if total == 0.0:
         return Traced(0.0, np.zeros(3), np.inf)
 
-    # What lies behind an optical depth of 100 is below 1e-43 of the light.
-    seen = np.concatenate([[0.0], np.cumsum(thickness)[:-1]]) < 100.0
-    parts = np.ones(len(begin), int)
-    parts[seen] = np.clip(np.ceil(thickness[seen] / MAX_TAU), 1, MAX_PARTS).astype(int)
-    of = np.repeat(np.arange(len(begin)), parts)
-    rank = np.arange(len(of)) - np.repeat(np.cumsum(parts) - parts, parts)
-    step = ((end - begin) / parts)[of]
-    begin = begin[of] + rank * step
-    end = begin + step
-    sigma_of = sigma.take(of)
-    tau = scale * _integrate(sigma_of, begin, end, OUTER)
-    before = np.concatenate([[0.0], np.cumsum(tau)[:-1]])
+    # Halve what is thick, until nothing is; what lies behind an optical depth of 100 is below 1e-43
+    # of the light.
+    of = np.arange(len(begin))
+    while True:
+        sigma_of = sigma.take(of)
+        tau = scale * _integrate(sigma_of, begin, end, OUTER)
+        before = np.concatenate([[0.0], np.cumsum(tau)[:-1]])
+        middle = (begin + end) / 2
+        thick = (tau > MAX_TAU) & (before < 100.0) & (middle > begin) & (middle < end)
+        if not thick.any():
+            break
+        twice = 1 + thick
+        second = np.cumsum(twice) - 1
+        of, begin, end = np.repeat(of, twice), np.repeat(begin, twice), np.repeat(end, twice)
+        begin[second[thick]] = middle[thick]
+        end[second[thick] - 1] = middle[thick]
+    step = end - begin
 
     t = begin[:, None] + step[:, None] * (OUTER[0] + 1) / 2
     inner = begin[:, None, None] + (t - begin[:, None])[..., None] * (INNER[0] + 1) / 2
