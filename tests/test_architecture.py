@@ -14,22 +14,14 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 
 LAYERS = [
     {"errors"},
-    {"schema", "quadrature"},
+    {"schema", "grids", "quadrature"},
     {"plan", "camera", "kernels"},
     {"render"},
-    {"config", "images", "grids"},
-    {"run", "describe", "opacity"},
-    {"tradeoff", "batch"},
+    {"config", "images"},
+    {"run", "describe"},
     {"cli"},
 ]
 """From the bottom to the top. A module may import those below it."""
-
-BESIDE = {
-    # The types of grids are data that everything above errors speaks of; grids imports errors only.
-    ("plan", "grids"),
-    ("render", "grids"),
-    ("kernels", "grids"),
-}
 
 HEAVY = {"numba", "OpenImageIO", "matplotlib", "dask", "distributed", "tqdm", "blosc", "rich"}
 OWNERS = {
@@ -92,7 +84,7 @@ def test_imports_point_one_way(path):
     for module in imports_of(path):
         there = unit_of(module) if module.startswith("volcli.") else ""
         known = any(there in layer for layer in LAYERS)
-        if not known or there == here or (here, there) in BESIDE:
+        if not known or there == here:
             continue
         assert rank(there) < rank(here), f"{name_of(path)} imports {module}"
 

@@ -133,7 +133,8 @@ def render(
         if constant is not None:
             tile_light = tile_opacity[:, None] * constant
         shape = tau[rows, columns].shape
-        tau[rows, columns] = tile_tau.reshape(shape)
+        with np.errstate(over="ignore"):  # beyond float32 it is Inf, and reported as such
+            tau[rows, columns] = tile_tau.reshape(shape)
         transmittance[rows, columns] = np.exp(-tile_tau).reshape(shape)
         opacity[rows, columns] = tile_opacity.reshape(shape)
         light[rows, columns] = tile_light.reshape(*shape, 3)

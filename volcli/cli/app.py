@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -68,7 +67,8 @@ def _root(
 
 
 def run_app(arguments: Sequence[str]) -> int:
-    """Run one command; returns the exit code. Errors that are foreseen print one line to stderr.
+    """Run one command; returns the exit code. Errors that are foreseen print one line to stderr,
+    and only a defect of volcli itself a traceback.
 
     Raises
     ------
@@ -89,11 +89,11 @@ def run_app(arguments: Sequence[str]) -> int:
         return 0
     except typer.Abort as error:
         raise KeyboardInterrupt from error
-    except Exception as error:
-        if os.environ.get("VOLCLI_DEBUG"):
-            raise
-        what = f"unexpected {type(error).__name__}: {error}"
-        return _fail(f"{what}; VOLCLI_DEBUG=1 shows where: please report it", 1)
+    except Exception as error:  # a defect of volcli: whoever mends it needs to see where
+        import traceback
+
+        traceback.print_exc()
+        return _fail(f"unexpected {type(error).__name__}: {error}; please report it", 1)
     if code == 130:
         raise KeyboardInterrupt
     if not arguments:

@@ -352,7 +352,7 @@ def _refine(
             axis=-1,
         )
         if drop is not None and len(drop):
-            fine[(fine >= 0) & drop[fine, np.arange(8)]] = BACKGROUND
+            fine[(fine >= 0) & drop[np.maximum(fine, 0), np.arange(8)]] = BACKGROUND
         entries, below = _entries(fine, first)
         nodes.append(entries.reshape(len(chunk), -1))
         children.append(below)
