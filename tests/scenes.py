@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-import numba
 import numpy as np
 import reference
 
@@ -17,7 +16,6 @@ from volcli.schema import Camera, Job
 
 EVERYTHING = frozenset({"picture", "transmittance", "opacity", "optical_depth", "depth"})
 IDENTITY = np.eye(4)
-JIT = not numba.config.DISABLE_JIT
 
 
 def tree_of(values, origin=(0, 0, 0), background=0.0, active=None, tiles=()):

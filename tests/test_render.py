@@ -226,8 +226,8 @@ THICK = [
 ]
 
 
-# Up to 2e-3: three nodes a span are not exact even where it is thin, and a dense cell is split into
-# spans of one length, not of one optical depth.
+# Up to 2e-3: three nodes are too few for a cell of optical depth from 0.3 to 1, which is not split;
+# four nodes and a split at 0.5 would leave 1e-5.
 NOT_YET = [
     ("smooth", "the same lattice", 3000.0),
     ("noise", "the same lattice", 12.0),
@@ -738,7 +738,9 @@ def test_depth_of_a_homogeneous_slab_is_its_closed_form():
             "noise", 30.0, marks=pytest.mark.xfail(strict=True, reason="2e-5: three nodes a span")
         ),
         pytest.param(
-            "smooth", 1000.0, marks=pytest.mark.xfail(strict=True, reason="2e-5: split by length")
+            "smooth",
+            1000.0,
+            marks=pytest.mark.xfail(strict=True, reason="2e-5: three nodes a span"),
         ),
     ],
 )
