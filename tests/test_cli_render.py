@@ -112,6 +112,7 @@ def test_quiet_leaves_only_the_result(folder):
 
 
 def test_explain_without_an_output_prints_the_plan_and_renders_nothing(folder, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.setattr("volcli.run.render", lambda *_, **__: pytest.fail("rendered"))
     ran = volcli("render", "ball.npz", "--explain")
     assert ran.code == 0
@@ -315,7 +316,7 @@ def test_a_reader_that_goes_away_is_no_error(folder):
     assert (folder / "a.exr").exists()
 
 
-@pytest.mark.parametrize("after_seconds", [0.3, 1.5])
+@pytest.mark.parametrize("after_seconds", [2, 4])
 def test_an_interrupt_ends_at_once_with_130_and_leaves_nothing(folder, after_seconds):
     arguments = ["render", "ball.npz", "-o", "a.exr", "--size", "9000x9000"]
     process = subprocess.Popen(

@@ -226,30 +226,7 @@ THICK = [
 ]
 
 
-# Up to 2e-3: three nodes are too few for a cell of optical depth from 0.3 to 1, which is not split;
-# four nodes and a split at 0.5 would leave 1e-5.
-NOT_YET = [
-    ("smooth", "the same lattice", 3000.0),
-    ("noise", "the same lattice", 12.0),
-    ("noise", "the same lattice", 100.0),
-    ("noise", "the same lattice", 3000.0),
-    ("noise", "rotated", 100.0),
-    ("noise", "rotated", 3000.0),
-]
-
-
-@pytest.mark.parametrize(
-    "field, which, thickness",
-    [
-        pytest.param(
-            *case,
-            marks=pytest.mark.xfail(strict=True, reason="up to 2e-3 in dense cells")
-            if case in NOT_YET
-            else (),
-        )
-        for case in THICK
-    ],
-)
+@pytest.mark.parametrize("field, which, thickness", THICK)
 def test_radiance_is_within_1e_4_of_its_maximum_however_dense_the_medium(field, which, thickness):
     """Optical depths of a cell up to some 0.1, 1, 10 and 300."""
     m, source, view = pair(field, which, "uniform")
@@ -734,14 +711,8 @@ def test_depth_of_a_homogeneous_slab_is_its_closed_form():
         ("smooth", 1.0),
         ("smooth", 3.0),
         ("noise", 1.0),
-        pytest.param(
-            "noise", 30.0, marks=pytest.mark.xfail(strict=True, reason="2e-5: three nodes a span")
-        ),
-        pytest.param(
-            "smooth",
-            1000.0,
-            marks=pytest.mark.xfail(strict=True, reason="2e-5: three nodes a span"),
-        ),
+        ("noise", 30.0),
+        ("smooth", 1000.0),
     ],
 )
 def test_depth_is_within_1e_6_of_the_distance(field, thickness):

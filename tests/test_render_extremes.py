@@ -136,7 +136,6 @@ def test_colours_of_any_size_are_scaled_as_they_are():
         np.testing.assert_allclose(other.radiance, one.radiance * factor, rtol=2e-7)
 
 
-@pytest.mark.xfail(strict=True, reason="a ray's light ends at T < 2^-24 whatever shines behind")
 def test_a_bright_source_behind_a_dark_one_is_seen_where_it_is_what_is_seen():
     """A black cloud of optical depth 18 before a source of radiance 1e6: T is 1.5e-8, below 2^-24,
     and still all of the light there is comes from behind."""

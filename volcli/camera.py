@@ -101,10 +101,12 @@ def make_camera(job: schema.Camera, box: Floats) -> Camera:
             )
     else:
         eye = None
-        along_z = np.linalg.norm(np.cross(up, [0.0, 0.0, 1.0])) < 0.5 * np.linalg.norm(up)
+        along_z = np.abs(up[:2]).max() < 0.5 * np.abs(up[2])
         forward = np.array([-1.0, 0.0, 0.0]) if along_z else np.array([0.0, 0.0, -1.0])
-    forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, up / np.linalg.norm(up))
+    forward = forward / np.abs(forward).max()
+    forward /= np.linalg.norm(forward)
+    upright = up / np.abs(up).max()  # first, or the square of a tiny up would be 0
+    right = np.cross(forward, upright / np.linalg.norm(upright))
     if np.linalg.norm(right) < _PARALLEL:
         raise UsageError(
             f"camera: up {_show(up)} lies along the view direction {_show(forward)}; "

@@ -43,7 +43,7 @@ class Plan:
     depth
         Whether the expected hit distance is evaluated.
     stop
-        Whether a ray may end where T < 2^-24: never when optical depth is asked for.
+        Whether a ray may end where nothing more can be seen: never when optical depth is asked for.
     step_voxels
         The midpoint rule's step, or None for the exact rule.
     nearest
@@ -130,5 +130,7 @@ def _terms(
     if "optical_depth" in layers:
         terms.append(Term("early end", False, "optical depth is asked for to the end of a ray"))
     else:
-        terms.append(Term("early end", True, "a ray ends where T < 2^-24"))
+        terms.append(
+            Term("early end", True, "a ray ends where what is behind cannot change it (T < 2^-24)")
+        )
     return terms

@@ -202,6 +202,7 @@ def make_integrator(
             scene.color.local_from_world,
             True if same else None,
             grid.origin - scene.color.origin,
+            scene.color.brightest,
         )
 
     def integrate(origins: NDArray[Any], directions: NDArray[Any]) -> tuple[Any, ...]:

@@ -124,6 +124,12 @@ class BrickGrid:
         atlas = self.arrays.atlas
         return np.array([atlas.min(axis=1), atlas.max(axis=1)])
 
+    @cached_property
+    def brightest(self) -> float:
+        """The largest magnitude of any value."""
+        parts = (self.arrays.atlas, self.arrays.constants)
+        return max(float(np.abs(part).max(initial=0.0)) for part in parts)
+
     @property
     def local_from_world(self) -> NDArray[np.float64]:
         """(3, 4): from world units to local voxels."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from volcli.kernels.compiler import jit, kernel
 from volcli.kernels.rules import exact_brick, exact_constant, midpoint_segment
-from volcli.kernels.source import STOP_TAU, State, refresh
+from volcli.kernels.source import State, faded, refresh
 from volcli.kernels.traversal import (
     clip,
     enter,
@@ -101,7 +101,8 @@ def integrate_rays(
         (n,) float64, written: the expected distance to a hit, +inf where nothing can be hit; or
         None.
     stop
-        Whether a ray ends where T < 2^-24; if not, optical depth goes on to the end.
+        Whether a ray ends where nothing more can change its light (`source.faded`); if not,
+        optical depth goes on to the end.
     optical_depth, radiance
         (n,) and (n, 3) float64, written.
     buffer
@@ -134,7 +135,7 @@ def integrate_rays(
         if step_voxels is not None:
             step = step_voxels / math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
 
-        state = State(0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
+        state = State(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, t_far)
         at = enter(grid, ray)
         t = 0.0
         while t < t_far and inside(grid, at):
@@ -197,9 +198,9 @@ def integrate_rays(
                         colour_ray,
                     )
                 evaluated += cells
-                if stop and state.tau > STOP_TAU:
+                if stop and faded(state, colour, depth):
                     break
-            if stop and state.tau > STOP_TAU:
+            if stop and faded(state, colour, depth):
                 break
             at = root_next(ray, at, axis)
 

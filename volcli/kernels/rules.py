@@ -13,13 +13,13 @@ import numpy as np
 from volcli.kernels.cell import absorbed, cubic, integral, load, trilinear
 from volcli.kernels.compiler import jit
 from volcli.kernels.source import (
-    STOP_TAU,
     State,
     add_span,
     add_spans,
     colour_at,
     colour_cell,
     darken,
+    faded,
 )
 from volcli.kernels.traversal import advance, brick_entry, start_all
 
@@ -33,7 +33,7 @@ def exact_brick(state, grid, scale, brick, corner, ray, t0, t1, colour, nearest,
     x, y, z = corner
     i, j, k, tx, ty, tz, sx, sy, sz, ddx, ddy, ddz = start_all(ray, t0, x, y, z, 1.0, 8.0)
     dx, dy, dz = ray.d
-    lit = (colour is not None or depth is not None) and state.tau <= STOP_TAU
+    lit = (colour is not None or depth is not None) and not faded(state, colour, depth)
     colour_entry, cx, cy, cz = 0, 0, 0, 0
     if colour is not None and colour.same_lattice is not None:
         cx, cy, cz = x + colour.shift[0], y + colour.shift[1], z + colour.shift[2]
@@ -76,7 +76,7 @@ def exact_constant(state, density, scale, t0, t1, colour, nearest, depth, colour
     """A region of one density, in closed form (where colour varies, a colour cell at a time)."""
     p = (density, 0.0, 0.0, 0.0)
     tm = 0.5 * (t0 + t1)
-    if (colour is None and depth is None) or state.tau > STOP_TAU:
+    if (colour is None and depth is None) or faded(state, colour, depth):
         state = darken(state, scale * density * (t1 - t0))
     elif colour is not None:
         state = add_spans(state, p, scale, tm, t0, t1, colour, nearest, depth, colour_ray)
@@ -137,11 +137,11 @@ def midpoint_segment(
             break
         samples += 1
         tau = scale * density_at(grid, entry, corner, ray, t, nearest) * length
-        if (colour is None and depth is None) or state.tau > STOP_TAU:
+        if (colour is None and depth is None) or faded(state, colour, depth):
             state = darken(state, tau)
             continue
         hit = state.T * absorbed(tau)
-        _, T, r, g, b, moment = state
+        _, T, r, g, b, moment, _ = state
         if colour is not None and hit > 0.0:
             cell = colour_cell(colour, colour_ray, t, t_far)[1]
             cr, cg, cb = colour_at(colour, nearest, cell, colour_ray, t)
@@ -150,5 +150,5 @@ def midpoint_segment(
             b += hit * cb
         if depth is not None:
             moment += hit * t
-        state = State(state.tau + tau, T - hit, r, g, b, moment)
+        state = State(state.tau + tau, T - hit, r, g, b, moment, t_far)
     return state, samples

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from volcli.kernels.cell import (
-    MAX_SPLIT,
     MAX_TAU,
+    SHORTEST,
     absorbed,
     antiderivative,
     hit_weights,
@@ -29,8 +29,11 @@ from volcli.kernels.cell import (
 from volcli.kernels.compiler import jit
 from volcli.kernels.traversal import brick_entry
 
-STOP_TAU = 24.0 * math.log(2.0)
-"""Beyond this optical depth T < 2^-24: radiance in float32 can no longer change."""
+FADED = 2.0**-24
+"""What is less than this part of a number cannot change it in float32."""
+
+STOP_TAU = -math.log(FADED)
+"""The optical depth beyond which T < FADED."""
 
 
 class State(NamedTuple):
@@ -46,6 +49,8 @@ class State(NamedTuple):
         Radiance.
     moment
         The integral of t T sigma dt, for the expected hit distance.
+    t_far
+        Where the ray leaves the volume: no hit is farther.
     """
 
     tau: float
@@ -54,6 +59,7 @@ class State(NamedTuple):
     g: float
     b: float
     moment: float
+    t_far: float
 
 
 class Colour(NamedTuple):
@@ -70,12 +76,15 @@ class Colour(NamedTuple):
     shift
         (3,) int64: local voxel of the colour grid minus that of the density; of use on the same
         lattice only.
+    brightest
+        The largest magnitude in the grid: no light that is still to come is brighter.
     """
 
     grid: Any
     local_from_world: NDArray[np.float64]
     same_lattice: Any
     shift: NDArray[np.int64]
+    brightest: float
 
 
 @jit
@@ -169,30 +178,42 @@ def add_span(state, p, scale, tm, t0, t1, colour, nearest, depth, cell, ray):
     """Add the light of [t0, t1] to the state.
 
     ``p`` is the density's cubic about the distance ``tm``; ``cell`` is the colour's, and ``ray`` is
-    in voxels of the colour grid. A span of optical depth above `MAX_TAU` is split.
+    in voxels of the colour grid. A span of optical depth above `MAX_TAU` is added in parts, each
+    half or twice as long as the one before, or the same, so that none is above.
     """
-    whole = max(0.0, scale * (antiderivative(p, t1 - tm) - antiderivative(p, t0 - tm)))
+    u, end = t0 - tm, t1 - tm
+    begin = antiderivative(p, u)
+    whole = max(0.0, scale * (antiderivative(p, end) - begin))
     if whole <= 0.0:
         return state
-    parts = 1
-    if whole > MAX_TAU:
-        parts = int(min(math.ceil(whole / MAX_TAU), MAX_SPLIT))
-    width = (t1 - t0) / parts
-    _, T, r, g, b, moment = state
-    for part in range(parts):
-        u0 = t0 + part * width - tm
-        tau, u, w = hit_weights(p, scale, u0, u0 + width)
-        hit = T * absorbed(tau)
+    _, T, r, g, b, moment, t_far = state
+    shortest = (end - u) * SHORTEST
+    length = end - u
+    tau = state.tau
+    while u < end:
+        to = min(u + length, end)
+        if scale * (antiderivative(p, to) - begin) > MAX_TAU and length > shortest:
+            length *= 0.5
+            continue
+        part, at, w = hit_weights(p, scale, u, to)
+        hit = T * absorbed(part)
         T -= hit
         if colour is not None:
-            for n in range(3):
-                cr, cg, cb = colour_at(colour, nearest, cell, ray, tm + u[n])
+            for n in range(4):
+                cr, cg, cb = colour_at(colour, nearest, cell, ray, tm + at[n])
                 r += hit * w[n] * cr
                 g += hit * w[n] * cg
                 b += hit * w[n] * cb
         if depth is not None:
-            moment += hit * (tm + u[0] * w[0] + u[1] * w[1] + u[2] * w[2])
-    return State(state.tau + whole, T, r, g, b, moment)
+            mean = at[0] * w[0] + at[1] * w[1] + at[2] * w[2] + at[3] * w[3]
+            moment += hit * (tm + mean)
+        tau += part
+        if faded(State(tau, T, r, g, b, moment, t_far), colour, depth):
+            break
+        u = to
+        begin = antiderivative(p, u)
+        length *= 2.0
+    return State(state.tau + whole, T, r, g, b, moment, t_far)
 
 
 @jit
@@ -200,10 +221,29 @@ def add_spans(state, p, scale, tm, t0, t1, colour, nearest, depth, ray):
     """As `add_span`, cut where the ray crosses the planes of the colour's own lattice."""
     t = t0
     while t < t1:
+        if faded(state, colour, depth):
+            rest = antiderivative(p, t1 - tm) - antiderivative(p, t - tm)
+            return darken(state, max(0.0, scale * rest))
         t_exit, cell = colour_cell(colour, ray, t, t1)
         state = add_span(state, p, scale, tm, t, t_exit, colour, nearest, depth, cell, ray)
         t = t_exit
     return state
+
+
+@jit
+def faded(state, colour, depth):
+    """Whether nothing that is still to come can change the result, in float32.
+
+    T alone does not tell: what is behind may be brighter than what is in front.
+    """
+    if state.tau <= STOP_TAU:
+        return False
+    T = math.exp(-state.tau)
+    if colour is not None:
+        seen = max(abs(state.r), max(abs(state.g), abs(state.b)))
+        if T * colour.brightest > FADED * seen:
+            return False
+    return depth is None or T * state.t_far <= FADED * state.moment
 
 
 @jit
@@ -212,10 +252,18 @@ def darken(state, tau):
 
     T is left behind: it is taken afresh from tau before it is used again.
     """
-    return State(state.tau + tau, state.T, state.r, state.g, state.b, state.moment)
+    return State(state.tau + tau, state.T, state.r, state.g, state.b, state.moment, state.t_far)
 
 
 @jit
 def refresh(state):
     """The state with T taken from tau, so that no product of many factors builds up."""
-    return State(state.tau, math.exp(-state.tau), state.r, state.g, state.b, state.moment)
+    return State(
+        state.tau,
+        math.exp(-state.tau),
+        state.r,
+        state.g,
+        state.b,
+        state.moment,
+        state.t_far,
+    )
