@@ -23,7 +23,7 @@ from volcli.plan import Plan
 
 Floats = NDArray[np.float32]
 
-TILE = 32
+TILE = 64
 """Edge of a tile in pixels: its rays share bricks, and there are enough tiles for all threads."""
 
 

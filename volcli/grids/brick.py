@@ -19,7 +19,6 @@ node (so the surface of a 4096-voxel tile is a handful of nodes); else the node 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -41,7 +40,7 @@ CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 BACKGROUND = -1
 """The entry of the constant 0."""
 
-_CHUNK = 64
+_CHUNK = 16
 """Nodes refined at a time: bounds the memory of the work to some tens of MB."""
 
 
@@ -310,25 +309,18 @@ def _flat(coordinates: NDArray[np.int64], width: int) -> NDArray[np.int64]:
     return (coordinates[:, 0] * width + coordinates[:, 1]) * width + coordinates[:, 2]
 
 
-def _entries(
-    signatures: NDArray[np.int32], first: int = 0
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """An entry for each signature (..., 8), and the signatures (m, 8) that become children.
-
-    Children are numbered from ``first``.
-    """
-    shape = signatures.shape[:-1]
-    flat = signatures.reshape(-1, 8)
-    entries = flat[:, 0].copy()
-    uniform = (flat[:, 0] < 0) & (flat == flat[:, :1]).all(axis=1)
+def _entries(signatures: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """An entry for each signature (n, 8), and the signatures (m, 8) that become children."""
+    entries = signatures[:, 0].copy()
+    uniform = (entries < 0) & (signatures == signatures[:, :1]).all(axis=1)
     rest = np.flatnonzero(~uniform)
-    rows = flat[rest]
+    rows = signatures[rest]
     all_constant = (rows < 0).all(axis=1)
     shared, which = np.unique(rows[all_constant], axis=0, return_inverse=True)
     own = rows[~all_constant]
-    entries[rest[all_constant]] = first + which.reshape(-1)
-    entries[rest[~all_constant]] = first + len(shared) + np.arange(len(own))
-    return entries.reshape(shape), np.concatenate([shared, own])
+    entries[rest[all_constant]] = which.reshape(-1)
+    entries[rest[~all_constant]] = len(shared) + np.arange(len(own))
+    return entries, np.concatenate([shared, own])
 
 
 def _refine(
@@ -349,21 +341,25 @@ def _refine(
         (n, 8): for each source child and corner, whether the part of it that a node's corner reads
         is all background, so that it counts as that constant.
     """
-    nodes, children, first = [np.empty((0, width**3), np.int32)], [], 0
     cubes = tables.reshape(-1, width, width, width)
-    for chunk in _chunks(signatures):
-        extended = _extended(chunk, cubes, width)
-        fine = np.stack(
-            [extended[:, x : x + width, y : y + width, z : z + width] for x, y, z in CORNERS],
-            axis=-1,
-        )
-        if drop is not None and len(drop):
-            fine[(fine >= 0) & drop[np.maximum(fine, 0), np.arange(8)]] = BACKGROUND
-        entries, below = _entries(fine, first)
-        nodes.append(entries.reshape(len(chunk), -1))
-        children.append(below)
-        first += len(below)
-    return np.concatenate(nodes), np.concatenate([np.empty((0, 8), np.int32), *children])
+    nodes = np.empty((len(signatures), width**3), np.int32)
+    found = [np.empty((0, 8), np.int32)]
+    places = [np.empty(0, np.int64)]
+    for start in range(0, len(signatures), _CHUNK):
+        extended = _extended(signatures[start : start + _CHUNK], cubes, width)
+        corners = [extended[:, x : x + width, y : y + width, z : z + width] for x, y, z in CORNERS]
+        nodes[start : start + _CHUNK] = corners[0].reshape(-1, width**3)
+        uniform = corners[0] < 0
+        for corner in corners[1:]:
+            uniform &= corner == corners[0]
+        mixed = np.nonzero(~uniform)
+        found.append(np.stack([corner[mixed] for corner in corners], axis=-1))
+        places.append(start * width**3 + np.flatnonzero(~uniform))
+    rows = np.concatenate(found)
+    if drop is not None and len(drop):
+        rows[(rows >= 0) & drop[np.maximum(rows, 0), np.arange(8)]] = BACKGROUND
+    nodes.reshape(-1)[np.concatenate(places)], children = _entries(rows)
+    return nodes, children
 
 
 def _extended(
@@ -376,7 +372,7 @@ def _extended(
         entry = signatures[:, corner]
         region[...] = entry[:, None, None, None]
         child = entry >= 0
-        region[child] = cubes[entry[child]][:, _read(x), _read(y), _read(z)]
+        region[child] = cubes[:, _read(x), _read(y), _read(z)][entry[child]]
     return extended
 
 
@@ -388,11 +384,6 @@ def _part(side: int, width: int) -> slice:
 def _read(side: int) -> slice:
     """What along an axis is read of the node itself (0): all; of its + neighbour (1): a layer."""
     return slice(0, 1) if side else slice(None)
-
-
-def _chunks(rows: NDArray[Any]) -> Iterator[NDArray[Any]]:
-    for start in range(0, len(rows), _CHUNK):
-        yield rows[start : start + _CHUNK]
 
 
 def _background_parts(
@@ -419,7 +410,7 @@ def _fill(
             region = bricks[:, _part(x, BRICK), _part(y, BRICK), _part(z, BRICK)]
             entry = rows[:, corner]
             leaf = entry >= 0
-            region[leaf] = values[entry[leaf]][:, _read(x), _read(y), _read(z)]
+            region[leaf] = values[:, _read(x), _read(y), _read(z)][entry[leaf]]
             region[~leaf] = constants[-1 - entry[~leaf]].reshape(-1, 1, 1, 1, *channels)
     return atlas.reshape(-1, APRON**3, *channels)
 
