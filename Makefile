@@ -11,18 +11,23 @@ demo: $(SETUP)
 	$(BIN)/volcli render configs/cloud.toml -o out/cloud.exr
 	$(BIN)/volcli render configs/cloud.toml -o out/cloud.png --maps transmittance
 
+# The second run has the kernels as plain Python, so that nothing rests on a quirk of the compiler.
 test: $(SETUP) lint
 	$(BIN)/python -m pytest -n 2
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -n 2 -q -r f \
+	    tests/test_kernels_cell.py tests/test_brick.py tests/test_render.py tests/test_render_extremes.py
 
 lint: $(SETUP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# Takes some minutes; render and load need OpenVDB (Debian: python3-openvdb, libopenvdb-tools).
 bench: $(SETUP)
 	$(BIN)/python -m benchmarks.accuracy
 	$(BIN)/python -m benchmarks.load
 	$(BIN)/python -m benchmarks.render
+	$(BIN)/python -m benchmarks.report
 
 # The README's pictures.
 gallery: $(SETUP)

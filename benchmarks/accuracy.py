@@ -11,6 +11,7 @@ convergence of midpoint is the slope of the mean error of transmittance over the
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ RAYS = 400
 STEPS = (1.0, 0.5, 0.25, 0.125, 0.0625)
 
 
-def compare(path: Path) -> dict[str, Any]:
+def compare(path: Path, rays: int = RAYS, steps: Sequence[float] = STEPS) -> dict[str, Any]:
     """Errors of the exact rule, and of midpoint at some steps, on one job."""
     prepared = prepare(load_job(path))
     job, plan, volume = prepared.job, prepared.plan, prepared.volume
@@ -51,18 +52,19 @@ def compare(path: Path) -> dict[str, Any]:
     scene = Scene(density, job.density.scale, color)
     tau = make_integrator(scene, _variant(plan, None))(origins, directions)[0]
     hit = np.flatnonzero(tau > 1e-3)
-    chosen = np.random.default_rng(1).choice(hit, min(RAYS, len(hit)), replace=False)
+    chosen = np.random.default_rng(1).choice(hit, min(rays, len(hit)), replace=False)
     origins, directions = origins[chosen], directions[chosen]
     truth = reference.trace_all(origins, directions, lattice, job.density.scale, color_lattice)
 
     found: dict[str, Any] = {"rays": len(chosen)}
-    for step in (None, *STEPS):
+    for step in (None, *steps):
         seen = make_integrator(scene, _variant(plan, step))(origins, directions)
         found["exact" if step is None else f"midpoint {step:g}"] = _errors(
             seen, truth, isinstance(color, BrickGrid)
         )
-    means = [found[f"midpoint {step:g}"]["transmittance_mean"] for step in STEPS]
-    found["observed_order"] = float(np.polyfit(np.log(STEPS), np.log(means), 1)[0])
+    if steps:
+        means = [found[f"midpoint {step:g}"]["transmittance_mean"] for step in steps]
+        found["observed_order"] = float(np.polyfit(np.log(steps), np.log(means), 1)[0])
     return found
 
 
@@ -75,7 +77,7 @@ def _lattice(tree: Any, grid: BrickGrid) -> Any:
     return reference.Lattice(reference.of_tree(tree), grid.world_from_index, grid.active_box)
 
 
-def _errors(seen: Any, truth: Any, colored: bool) -> dict[str, float]:
+def _errors(seen: Any, truth: Any, colored: bool) -> dict[str, float | None]:
     tau, light, distance, _ = seen
     true_tau, true_light, true_distance = truth
     transmittance = np.abs(np.exp(-tau) - np.exp(-true_tau))
@@ -83,12 +85,17 @@ def _errors(seen: Any, truth: Any, colored: bool) -> dict[str, float]:
         "transmittance": float(transmittance.max()),
         "transmittance_mean": float(transmittance.mean()),
         "optical_depth_relative": float((np.abs(tau - true_tau) / true_tau).max()),
-        "distance_relative": float((np.abs(distance - true_distance) / true_distance).max()),
+        "distance_relative": _largest(np.abs(distance - true_distance) / true_distance),
     }
     if colored:
         difference = np.abs(light - true_light).max()
         errors["radiance_relative_to_max"] = float(difference / np.abs(true_light).max())
     return errors
+
+
+def _largest(errors: Any) -> float | None:
+    """The largest, or None where a coarse step saw nothing to measure a distance to."""
+    return float(errors.max()) if np.isfinite(errors).all() else None
 
 
 def main(arguments: list[str]) -> None:
@@ -100,7 +107,7 @@ def main(arguments: list[str]) -> None:
         print(f"\n{path.stem}: {results[path.stem]['rays']} rays")
         for name, errors in results[path.stem].items():
             if isinstance(errors, dict):
-                shown = "  ".join(f"{key} {value:.1e}" for key, value in errors.items())
+                shown = "  ".join(f"{key} {value or 0:.1e}" for key, value in errors.items())
                 print(f"  {name:16s} {shown}")
         print(f"  order of convergence of midpoint: {results[path.stem]['observed_order']:.2f}")
     write_results("accuracy", results)

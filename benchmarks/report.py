@@ -1,0 +1,103 @@
+"""Puts the results into the README: ``python -m benchmarks.report``.
+
+Between ``<!-- NAME -->`` and ``<!-- /NAME -->`` the README holds what this module makes of
+``results/NAME.json``, and nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+from benchmarks.accuracy import STEPS
+from benchmarks.common import RESULTS
+
+README = RESULTS.parents[1] / "README.md"
+
+
+def accuracy(results: dict[str, Any]) -> str:
+    """Errors of both rules on the samples."""
+    jobs = [name for name in results if name != "machine"]
+    rows = [["largest error", *jobs]]
+    for text, key in (
+        ("transmittance", "transmittance"),
+        ("radiance, of its maximum", "radiance_relative_to_max"),
+        ("hit distance, of itself", "distance_relative"),
+    ):
+        rows.append([f"`exact`: {text}", *(_error(results[j]["exact"].get(key)) for j in jobs)])
+    for step in STEPS:
+        cells = (_error(results[j][f"midpoint {step:g}"]["transmittance"]) for j in jobs)
+        rows.append([f"`--step {step:g}`: transmittance", *cells])
+    orders = sorted(results[j]["observed_order"] for j in jobs)
+    return (
+        f"{_markdown(rows)}\n\nWhere density is smooth `midpoint` converges with order 2 (a test "
+        f"holds it to that). On these rough volumes\nthe mean error falls with order "
+        f"{orders[0]:.1f} to {orders[-1]:.1f} over steps from 1 to 1/16 of a voxel."
+    )
+
+
+def render(results: dict[str, Any]) -> str:
+    """Kernel times and errors beside vdb_render's."""
+    (name,) = (key for key in results if key != "machine")
+    runs, machine = results[name]["runs"], results["machine"]
+    rows = [["", "median", "opacity error, max", "mean", "times faster (least to most)"]]
+    for run, row in runs.items():
+        faster = row.get("times_faster_than_vdb_render")
+        error = row["opacity_error"]
+        rows.append(
+            [
+                run,
+                f"{row['seconds']['median'] * 1e3:.0f} ms",
+                _error(error["max"] or None),
+                _error(error["mean"] or None),
+                f"{faster['median']:.1f} ({faster['min']:.1f} to {faster['max']:.1f})"
+                if faster
+                else "",
+            ]
+        )
+    rounds = next(iter(runs.values()))["seconds"]["rounds"]
+    return (
+        f"{_markdown(rows)}\n\n{results[name]['voxels']:,} voxels, 512 x 512 rays, "
+        f"{machine['threads']} threads, {rounds} rounds."
+    )
+
+
+def load(results: dict[str, Any]) -> str:
+    """Reading beside OpenVDB's."""
+    (name,) = (key for key in results if key != "machine")
+    row = results[name]
+    ours, theirs, ratio = row["volcli"], row["openvdb"], row["volcli_over_openvdb"]
+    return (
+        f"for {row['voxels']:,} voxels {ours['seconds']['median']:.2f} s against "
+        f"{theirs['seconds']['median']:.2f} s, {ratio['median']:.1f} times as\nlong "
+        f"({ratio['min']:.1f} to {ratio['max']:.1f} over {ratio['rounds']} rounds), with a peak of "
+        f"{ours['peak_bytes'] / 1e6:.0f} MB for {ours['held_bytes'] / 1e6:.0f} MB of bricks."
+    )
+
+
+def _error(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0e}".replace("e-0", "e-")
+
+
+def _markdown(rows: list[list[str]]) -> str:
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]])
+
+
+def main() -> None:
+    """Rewrite the README's results."""
+    text = README.read_text(encoding="utf-8")
+    for make in (accuracy, render, load):
+        name = make.__name__
+        results = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+        block = f"<!-- {name} -->\n{make(results)}\n<!-- /{name} -->"
+        text, count = re.subn(
+            rf"<!-- {name} -->.*?<!-- /{name} -->", lambda _, b=block: b, text, flags=re.DOTALL
+        )
+        assert count == 1, f"the README has no place for {name}"
+    README.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
