@@ -59,12 +59,19 @@ class Camera:
         pixel = 2.0 * self.half_height / height
         x = (np.arange(width)[columns] + 0.5 - width / 2) * pixel
         y = (height / 2 - (np.arange(height)[rows] + 0.5)) * pixel
-        across = (x[None, :, None] * self.right + y[:, None, None] * self.upward).reshape(-1, 3)
-        if self.perspective:
-            directions = across + self.forward
-            directions /= np.sqrt(np.einsum("ij,ij->i", directions, directions))[:, None]
-            return np.broadcast_to(self.eye, directions.shape).copy(), directions
-        return self.eye + across, np.broadcast_to(self.forward, across.shape).copy()
+        rays = np.empty((2, len(y), len(x), 3))
+        for axis in range(3):
+            across = x * self.right[axis] + (y * self.upward[axis])[:, None]
+            if self.perspective:
+                rays[0, ..., axis] = self.eye[axis]
+                rays[1, ..., axis] = across + self.forward[axis]
+            else:
+                rays[0, ..., axis] = across + self.eye[axis]
+                rays[1, ..., axis] = self.forward[axis]
+        if self.perspective:  # the frame is orthonormal, so the length needs no sum over axes
+            rays[1] /= np.sqrt(1.0 + x * x + (y * y)[:, None])[..., None]
+        origins, directions = rays.reshape(2, -1, 3)
+        return origins, directions
 
     def axial(self, directions: Floats) -> Floats:
         """(n,): the part along the camera's axis of a unit of distance along each ray."""
