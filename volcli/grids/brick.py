@@ -43,6 +43,9 @@ BACKGROUND = -1
 _CHUNK = 16
 """Nodes refined at a time: bounds the memory of the work to some tens of MB."""
 
+_LEAVES = 256
+"""Leaves or bricks worked on at a time, so that what is made of them stays in the cache."""
+
 
 class BrickArrays(NamedTuple):
     """The arrays of a `BrickGrid` as the kernels take them; local voxels count from ``origin``.
@@ -275,8 +278,7 @@ class _SourceTables:
         in_root, in_block, at_brick = widths == ROOT_WIDTH, widths == 128, widths == BRICK
 
         roots = origins // ROOT_WIDTH
-        self.roots, root_of = np.unique(roots, axis=0, return_inverse=True)
-        root_of = root_of.reshape(-1)
+        self.roots, root_of = _unique_roots(roots)
         self.root_entries = np.full(len(self.roots), BACKGROUND, np.int32)
         self.root_entries[root_of[in_root]] = entries[in_root]
         with_upper = np.unique(root_of[~in_root])
@@ -303,6 +305,15 @@ class _SourceTables:
             [known.get(tuple(n), BACKGROUND) for n in (cell + CORNERS).tolist()] for cell in cells
         ]
         return cells, np.array(signatures, np.int32).reshape(-1, 8)
+
+
+def _unique_roots(roots: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    """The distinct rows in order, and which of them each row is: by one key of 20 bits an axis."""
+    bits, half = 20, 1 << 19  # an int32 coordinate / 4096
+    x, y, z = (roots + half).T
+    keys, root_of = np.unique((x << 2 * bits) | (y << bits) | z, return_inverse=True)
+    axes = [keys >> 2 * bits, keys >> bits & 2 * half - 1, keys & 2 * half - 1]
+    return np.stack(axes, axis=1) - half, root_of
 
 
 def _flat(coordinates: NDArray[np.int64], width: int) -> NDArray[np.int64]:
@@ -390,11 +401,15 @@ def _background_parts(
     values: NDArray[np.float32], background: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
     """(n, 8): whether the part of each leaf that a brick's corner reads is all background."""
-    same = values == background
-    if values.ndim == 5:
-        same = same.all(axis=-1)
-    parts = [same[:, _read(x), _read(y), _read(z)].all(axis=(1, 2, 3)) for x, y, z in CORNERS]
-    return np.stack(parts, axis=-1)
+    empty = np.empty((len(values), 8), np.bool_)
+    for start in range(0, len(values), _LEAVES):
+        same = values[start : start + _LEAVES] == background
+        if values.ndim == 5:
+            same = same.all(axis=-1)
+        for corner, (x, y, z) in enumerate(CORNERS):
+            part = same[:, _read(x), _read(y), _read(z)]
+            empty[start : start + _LEAVES, corner] = part.all(axis=(1, 2, 3))
+    return empty
 
 
 def _fill(
@@ -403,15 +418,15 @@ def _fill(
     """The atlas: for each brick, its leaf's values and the apron out of its + neighbours'."""
     channels = values.shape[4:]
     atlas = np.empty((len(signatures), APRON, APRON, APRON, *channels), np.float32)
-    chunk = 16 * _CHUNK
-    for start in range(0, len(signatures), chunk):
-        rows, bricks = signatures[start : start + chunk], atlas[start : start + chunk]
+    for start in range(0, len(signatures), _LEAVES):
+        rows, bricks = signatures[start : start + _LEAVES], atlas[start : start + _LEAVES]
         for corner, (x, y, z) in enumerate(CORNERS):
             region = bricks[:, _part(x, BRICK), _part(y, BRICK), _part(z, BRICK)]
             entry = rows[:, corner]
-            leaf = entry >= 0
-            region[leaf] = values[:, _read(x), _read(y), _read(z)][entry[leaf]]
-            region[~leaf] = constants[-1 - entry[~leaf]].reshape(-1, 1, 1, 1, *channels)
+            constant = np.flatnonzero(entry < 0)
+            if len(constant) < len(entry):  # of a constant's leaf any, overwritten at once
+                region[...] = values[:, _read(x), _read(y), _read(z)][np.maximum(entry, 0)]
+            region[constant] = constants[-1 - entry[constant]].reshape(-1, 1, 1, 1, *channels)
     return atlas.reshape(-1, APRON**3, *channels)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,9 @@ from numpy.typing import NDArray
 
 from volcli.errors import VolumeError
 from volcli.grids.tree import Tree
+
+_CHUNK = 1024
+"""Leaves looked at at a time, so that what a test makes of them stays in the cache."""
 
 
 def settle_nonfinite(tree: Tree, where: str, nonfinite: str) -> tuple[Tree, list[str]]:
@@ -29,10 +33,10 @@ def settle_nonfinite(tree: Tree, where: str, nonfinite: str) -> tuple[Tree, list
     """
     with np.errstate(over="ignore"):  # a double beyond float32 becomes Inf, and is found below
         parts = [p.astype(np.float32, copy=False) for p in _parts(tree)]
-    bad = [~np.isfinite(p) for p in parts]
-    count = sum(int(np.count_nonzero(b)) for b in bad)
+    count = _count(parts, lambda values: ~np.isfinite(values))
     if count == 0:
         return _with_parts(tree, parts), []
+    bad = [~np.isfinite(p) for p in parts]
     first = _first_index(tree, bad)
     if nonfinite == "error":
         raise VolumeError(
@@ -46,11 +50,17 @@ def settle_nonfinite(tree: Tree, where: str, nonfinite: str) -> tuple[Tree, list
 def clamp_negative(tree: Tree, where: str) -> tuple[Tree, list[str]]:
     """The tree with values below 0 raised to 0, and a warning that counts them."""
     parts = _parts(tree)
-    count = sum(int(np.count_nonzero(p < 0)) for p in parts)
+    count = _count(parts, lambda values: values < 0)
     if count == 0:
         return tree, []
     clamped = [np.maximum(p, p.dtype.type(0)) for p in parts]
     return _with_parts(tree, clamped), [f"{where}: {count} values below 0, taken as 0"]
+
+
+def _count(parts: list[NDArray[Any]], test: Callable[[NDArray[Any]], NDArray[np.bool_]]) -> int:
+    """How many values pass a test."""
+    chunks = (p[i : i + _CHUNK] for p in map(np.atleast_1d, parts) for i in range(0, len(p), _CHUNK))
+    return sum(int(np.count_nonzero(test(chunk))) for chunk in chunks)
 
 
 def _parts(tree: Tree) -> list[NDArray[Any]]:
