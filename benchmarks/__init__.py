@@ -1,1 +1,1 @@
-"""Benchmarks: one file a question, run as ``python -m benchmarks.render``; see README.md here."""
+"""Benchmarks: one file a question, run as ``python -m benchmarks.render``."""

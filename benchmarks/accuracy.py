@@ -40,12 +40,12 @@ def compare(path: Path, rays: int = RAYS, steps: Sequence[float] = STEPS) -> dic
     prepared = prepare(load_job(path))
     job, plan, volume = prepared.job, prepared.plan, prepared.volume
     density, _ = load_density(volume, plan.density, "error")
-    lattice = _lattice(volume.read_tree(plan.density), density)
+    lattice = lattice_of(volume.read_tree(plan.density), density)
     color: Any = job.color.value
     color_lattice = None
     if plan.color is not None:
         color, _ = load_color(volume, plan.color, "error")
-        color_lattice = _lattice(volume.read_tree(plan.color), color)
+        color_lattice = lattice_of(volume.read_tree(plan.color), color)
 
     camera = make_camera(job.camera, density.world_box())
     origins, directions = camera.rays(slice(None), slice(None))
@@ -70,10 +70,11 @@ def compare(path: Path, rays: int = RAYS, steps: Sequence[float] = STEPS) -> dic
 
 def _variant(plan: Plan, step: float | None) -> Plan:
     """The plan with depth, to the end of every ray, by the rule that is asked for."""
-    return replace(plan, depth=True, stop=False, step_voxels=step)
+    return replace(plan, depth=True, step_voxels=step)
 
 
-def _lattice(tree: Any, grid: BrickGrid) -> Any:
+def lattice_of(tree: Any, grid: BrickGrid) -> Any:
+    """A grid as the reference renderer takes it."""
     return reference.Lattice(reference.of_tree(tree), grid.world_from_index, grid.active_box)
 
 

@@ -721,24 +721,13 @@ def test_depth_is_within_1e_6_of_the_distance(field, thickness):
     assert_depth(shoot(m, view, thickness / size(m)), view, distance, PROMISED_DEPTH)
 
 
-def test_light_is_the_same_whether_or_not_a_ray_may_end_early():
-    m, source, view = baseline()
-    layers = scenes.EVERYTHING - {"optical_depth"}
-    for scale in (2.0, 60.0, 3000.0):
-        whole = shoot(m, view, scale, source)
-        short = shoot(m, view, scale, source, layers=layers)
-        np.testing.assert_array_equal(whole.radiance, short.radiance)
-        np.testing.assert_array_equal(whole.opacity, short.opacity)
-        assert np.abs(whole.transmittance - short.transmittance).max() <= 2.0**-24
-    assert short.evaluations < whole.evaluations / 2, "and it saves work"
-
-
-def test_optical_depth_maps_never_stop_early():
+def test_optical_depth_goes_on_where_light_has_faded():
     m, source, view = baseline()
     tau, _, _ = truth(m, view, 3000.0)
     assert tau.max() > 1000
-    result = shoot(m, view, 3000.0, source)
-    np.testing.assert_allclose(result.optical_depth, tau, rtol=2e-7, atol=1e-12)
+    for layers in (scenes.EVERYTHING, {"picture"}):
+        result = shoot(m, view, 3000.0, source, layers=layers)
+        np.testing.assert_allclose(result.optical_depth, tau, rtol=2e-7, atol=1e-12)
 
 
 @pytest.mark.needs_jit

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from volcli.grids import GridHeader, Volume, color_grid, density_grid
 from volcli.schema import Job
 
-ALL_LAYERS = ("transmittance", "opacity", "optical_depth", "depth")
-
 
 @dataclass(frozen=True)
 class Term:
@@ -42,8 +40,6 @@ class Plan:
         The grids to read; ``color`` is None where the colour is a constant or not needed.
     depth
         Whether the expected hit distance is evaluated.
-    stop
-        Whether a ray may end where nothing more can be seen: never when optical depth is asked for.
     step_voxels
         The midpoint rule's step, or None for the exact rule.
     nearest
@@ -57,7 +53,6 @@ class Plan:
     density: GridHeader
     color: GridHeader | None
     depth: bool
-    stop: bool
     step_voxels: float | None
     nearest: bool
     terms: tuple[Term, ...]
@@ -89,12 +84,10 @@ def make_plan(job: Job, volume: Volume, layers: frozenset[str]) -> Plan:
         color, notes = color_grid(volume, job.color.grid)
         warnings += notes
     depth = "depth" in layers
-    stop = "optical_depth" not in layers
     return Plan(
         density=density,
         color=color,
         depth=depth,
-        stop=stop,
         step_voxels=job.quadrature.step_voxels,
         nearest=job.density.interpolation == "nearest",
         terms=tuple(_terms(job, density, color, layers)),
@@ -127,10 +120,4 @@ def _terms(
         terms.append(Term("background", True, f"image {job.background.image.name}"))
     else:
         terms.append(Term("background", False, "transparent"))
-    if "optical_depth" in layers:
-        terms.append(Term("early end", False, "optical depth is asked for to the end of a ray"))
-    else:
-        terms.append(
-            Term("early end", True, "a ray ends where what is behind cannot change it (T < 2^-24)")
-        )
     return terms

@@ -26,10 +26,12 @@ __all__ = [
     "alpha_from_density",
     "composite",
     "expected_distance",
+    "hit_density",
     "homogeneous_radiance",
     "opacity",
     "optical_depth",
     "optical_depth_before",
+    "segment_radiance",
     "transmittance",
     "transmittance_from_alpha",
     "transmittance_from_density",
@@ -39,7 +41,7 @@ __all__ = [
 
 
 def optical_depth(sigma: ArrayLike, delta: ArrayLike) -> Floats:
-    """tau = integral of sigma ds = sum_n sigma_n delta_n, shape (...,). Digest, eq. 5 (exponent).
+    """tau = integral of sigma ds = sum_n sigma_n delta_n, shape (...,).
 
     >>> optical_depth([2.0, 2.0], [0.5, 0.75])
     np.float64(2.5)
@@ -63,7 +65,7 @@ def optical_depth_before(sigma: ArrayLike, delta: ArrayLike) -> Floats:
 
 
 def transmittance(tau: ArrayLike) -> Floats:
-    """T = exp(-tau): the probability of crossing an optical depth without a hit. Digest, eq. 5.
+    """T = exp(-tau): the probability of crossing without a hit (digest: transmittance).
 
     >>> transmittance(0.5).round(5)
     np.float64(0.60653)
@@ -72,7 +74,7 @@ def transmittance(tau: ArrayLike) -> Floats:
 
 
 def opacity(tau: ArrayLike) -> Floats:
-    """O = 1 - T, as -expm1(-tau): right to rounding however thin the medium. Digest, eq. 6.
+    """O = 1 - T, as -expm1(-tau): right to rounding however thin the medium (digest: opacity).
 
     >>> float(opacity(1e-20))
     1e-20
@@ -149,17 +151,36 @@ def composite(
     return colour + behind[..., None] * np.asarray(background, np.float64)
 
 
-def homogeneous_radiance(radiance: ArrayLike, sigma: ArrayLike, length: ArrayLike) -> Floats:
-    """C = c (1 - exp(-sigma (b - a))): one radiance and one extinction over [a, b]. Digest, eq. 9.
+def hit_density(sigma: ArrayLike, tau_before: ArrayLike) -> Floats:
+    """T(t) sigma(t), (...,): the probability density of the distance of the first hit, 1 / length.
 
-    The same form holds with sigma (b - a) replaced by the optical depth of any density: a constant
-    radiance asks for no samples inside.
+    Its integral is the opacity, which is the distribution function (digest: hit probability).
+
+    >>> hit_density(2.0, np.log(4)).round(12)
+    np.float64(0.5)
+    """
+    return transmittance(tau_before) * np.asarray(sigma, np.float64)
+
+
+def segment_radiance(radiance: ArrayLike, tau: ArrayLike, tau_before: ArrayLike = 0.0) -> Floats:
+    """C = c T(a) (1 - T(a, b)), (...,): one radiance over [a, b] (digest: alternate form).
+
+    ``tau`` is the optical depth of [a, b], ``tau_before`` that in front of a: neither radiance nor
+    density is sampled inside beyond it.
+
+    >>> segment_radiance(8.0, np.log(2), tau_before=np.log(4)).round(12)
+    np.float64(1.0)
+    """
+    return np.asarray(radiance, np.float64) * transmittance(tau_before) * opacity(tau)
+
+
+def homogeneous_radiance(radiance: ArrayLike, sigma: ArrayLike, length: ArrayLike) -> Floats:
+    """C = c (1 - exp(-sigma (b - a))): one radiance and one extinction over [a, b] (homogeneous).
 
     >>> homogeneous_radiance(2.0, np.log(2), 1.0).round(12)
     np.float64(1.0)
     """
-    thickness = np.asarray(sigma, np.float64) * np.asarray(length, np.float64)
-    return np.asarray(radiance, np.float64) * opacity(thickness)
+    return segment_radiance(radiance, np.asarray(sigma, np.float64) * np.asarray(length))
 
 
 def expected_distance(sigma: ArrayLike, delta: ArrayLike, t: ArrayLike) -> Floats:

@@ -17,11 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from volcli.camera import Camera
-from volcli.errors import NonFiniteError
+from volcli.errors import NonFiniteError, UsageError
 from volcli.grids import BrickGrid, Progress
 from volcli.plan import Plan
 
 Floats = NDArray[np.float32]
+
+MAX_STEPS = 10_000_000
+"""Samples of the midpoint rule along one ray at most: beyond, a picture would never be done."""
 
 TILE = 64
 """Edge of a tile in pixels: its rays share bricks, and there are enough tiles for all threads."""
@@ -106,7 +109,10 @@ def render(
     ------
     NonFiniteError
         If a pixel is NaN or Inf, naming the first.
+    UsageError
+        If the midpoint rule's step is so short that a ray would take more than `MAX_STEPS`.
     """
+    _check_step(scene.density, plan)
     width, height = camera.resolution
 
     def layer(value: float, *channels: int) -> Floats:
@@ -217,7 +223,6 @@ def make_integrator(
             plan.step_voxels,
             True if plan.nearest else None,
             distance,
-            plan.stop,
             tau,
             light,
             segment_buffer(),
@@ -225,6 +230,18 @@ def make_integrator(
         return tau, light, distance, int(evaluations)
 
     return integrate
+
+
+def _check_step(grid: BrickGrid, plan: Plan) -> None:
+    if plan.step_voxels is None or grid.is_empty:
+        return
+    low, high = grid.support("linear")
+    longest = float(np.linalg.norm(high - low))
+    if longest / plan.step_voxels > MAX_STEPS:
+        raise UsageError(
+            f"--step {plan.step_voxels:g}: up to {longest / plan.step_voxels:.0e} samples a ray; "
+            f"give at least {1.1 * longest / MAX_STEPS:.1e} voxels, or leave it out: exact is faster"
+        )
 
 
 def _check_finite(result: RenderResult) -> None:

@@ -32,7 +32,7 @@ WEIGHT = (18 - math.sqrt(30)) / (18 + math.sqrt(30))
 
 MAX_TAU = 0.5
 """A span of larger optical depth is cut before its source is sampled: within it exp(-tau) has to be
-close to the polynomials that three nodes integrate."""
+close to the polynomials that four nodes integrate."""
 
 SHORTEST = 2.0**-20
 """A part of a span is no shorter than this share of it, however dense it is."""
@@ -177,7 +177,7 @@ def hit_weights(p, scale, u0, u1):
     wc = hit_density(p, scale, begin, u[2])
     wd = WEIGHT * hit_density(p, scale, begin, u[3])
     total = wa + wb + wc + wd
-    if total <= 0.0:  # nothing is hit here: tau is 0 as well
+    if total <= 0.0:  # nothing is hit here, or nothing that float64 can tell apart
         return tau, u, (0.0, 0.5, 0.5, 0.0)
     return tau, u, (wa / total, wb / total, wc / total, wd / total)
 

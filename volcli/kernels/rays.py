@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from volcli.kernels.compiler import jit, kernel
 from volcli.kernels.rules import exact_brick, exact_constant, midpoint_segment
-from volcli.kernels.source import State, faded, refresh
+from volcli.kernels.source import State, refresh
 from volcli.kernels.traversal import (
     clip,
     enter,
@@ -78,7 +78,6 @@ def integrate_rays(
     step_voxels,
     nearest,
     depth,
-    stop,
     optical_depth,
     radiance,
     buffer,
@@ -100,9 +99,6 @@ def integrate_rays(
     depth
         (n,) float64, written: the expected distance to a hit, +inf where nothing can be hit; or
         None.
-    stop
-        Whether a ray ends where nothing more can change its light (`source.faded`); if not,
-        optical depth goes on to the end.
     optical_depth, radiance
         (n,) and (n, 3) float64, written.
     buffer
@@ -198,10 +194,6 @@ def integrate_rays(
                         colour_ray,
                     )
                 evaluated += cells
-                if stop and faded(state, colour, depth):
-                    break
-            if stop and faded(state, colour, depth):
-                break
             at = root_next(ray, at, axis)
 
         optical_depth[n] = state.tau

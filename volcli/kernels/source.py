@@ -110,7 +110,7 @@ def colour_cell(colour, ray, t, t_end):
 def cell_after(ray, axis, t, width):
     """(lowest voxel of the aligned cell just after t, where it ends), along one axis."""
     o, d, inverse = ray.o[axis], ray.d[axis], ray.inverse[axis]
-    crossed = t + 1e-13 * max(1.0, t)  # a plane nearer than this is behind us
+    crossed = t + 1e-13 * max(abs(width * inverse), t)  # a plane nearer than this is behind us
     cell = math.floor((o + t * d) / width)
     if d > 0.0:
         end = ((cell + 1) * width - o) * inverse
@@ -232,7 +232,8 @@ def add_spans(state, p, scale, tm, t0, t1, colour, nearest, depth, ray):
 
 @jit
 def faded(state, colour, depth):
-    """Whether nothing that is still to come can change the result, in float32.
+    """Whether light that is still to come is less than 2^-24 of what the ray's brightest channel
+    has seen (and distance likewise): then only optical depth goes on.
 
     T alone does not tell: what is behind may be brighter than what is in front.
     """
