@@ -59,7 +59,9 @@ def clamp_negative(tree: Tree, where: str) -> tuple[Tree, list[str]]:
 
 def _count(parts: list[NDArray[Any]], test: Callable[[NDArray[Any]], NDArray[np.bool_]]) -> int:
     """How many values pass a test."""
-    chunks = (p[i : i + _CHUNK] for p in map(np.atleast_1d, parts) for i in range(0, len(p), _CHUNK))
+    chunks = (
+        p[i : i + _CHUNK] for p in map(np.atleast_1d, parts) for i in range(0, len(p), _CHUNK)
+    )
     return sum(int(np.count_nonzero(test(chunk))) for chunk in chunks)
 
 

@@ -13,6 +13,7 @@ Nothing here knows a tree, a header or the name of a file.
 
 from __future__ import annotations
 
+import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,8 +21,8 @@ from enum import IntEnum, IntFlag
 from struct import Struct
 from typing import Any
 
-import blosc
 import numpy as np
+from blosc.blosc_extension import decompress_ptr
 from numpy.typing import NDArray
 
 HAS_BLOCK_MODE = 222
@@ -31,6 +32,7 @@ _INT64 = Struct("<q")
 _UINT32 = Struct("<I")
 _BLOSC_SIZES = Struct("<4x3i")  # of a blosc header: bytes unpacked, of a block, packed
 _BLOSC_HEADER = 16
+_LEAF_MASK = 64  # bytes
 
 
 class Damage(Exception):
@@ -191,6 +193,8 @@ class BlockCodec:
         self.half = half and kind.stored.kind == "f"
         self.packed_dtype = np.dtype("<f2") if self.half else kind.stored
         self.packed_bytes = self.packed_dtype.itemsize * kind.components
+        # Blosc undoes the 2 kB of a leaf in a microsecond: threads cost each other more than that.
+        self.gains_from_threads = bool(compression & Compression.ZIP) and not self.blosc
         self.fixed_leaf_bytes = {"bool": 140, "mask": 76}.get(kind.name)
 
     def locate(self, at: int, size: int, active: int) -> Block:
@@ -220,6 +224,55 @@ class BlockCodec:
         if at + abs(length) > self.end:
             raise Damage(at, f"{abs(length)} bytes of values, {max(self.end - at, 0)} left")
         return mode, extra_at, count, at, length
+
+    def locate_leaves(self, at: int, count: int) -> tuple[list[int], list[Block], int] | None:
+        """Find masks and blocks of the leaves at ``at``, and where they end; None: ask `locate`.
+
+        Steps from length to length and checks them afterwards, all at once. None where blocks have
+        no length, or something is wrong, so that `locate` says what and where.
+        """
+        if not (self.has_mode and self.has_length):
+            return None
+        data, value_at = self.data, _INT64.unpack_from
+        extra = [
+            values * self.kind.stored_bytes + selection * _LEAF_MASK
+            for values, selection in zip(_VALUES_OF_MODE, _SELECTION_OF_MODE, strict=True)
+        ]
+        may_lack_length, inactive = self.half and self.masked, bytes(_LEAF_MASK)
+        masks_at, modes, data_at, lengths = [], [], [], []
+        try:
+            for _ in range(count):
+                masks_at.append(at)
+                mode_at = at + _LEAF_MASK
+                mode = data[mode_at]
+                at = mode_at + 1 + extra[mode]
+                length = 0
+                if (
+                    not may_lack_length
+                    or mode == 6
+                    or data[mode_at - _LEAF_MASK : mode_at] != inactive
+                ):
+                    length = value_at(data, at)[0]
+                    at += 8
+                modes.append(mode)
+                data_at.append(at)
+                lengths.append(length)
+                at += abs(length)
+        except (IndexError, struct.error):
+            return None
+        if at > self.end:
+            return None
+        stored = np.full(count, 8 * _LEAF_MASK)
+        if self.masked:
+            masks = self.gather(np.array(masks_at), _LEAF_MASK).view(np.uint64)
+            active = np.bitwise_count(masks).sum(axis=1, dtype=np.int64)
+            stored = np.where(np.array(modes) == Mode.ALL_STORED, stored, active)
+        found = np.array(lengths)
+        if ((found <= 0) & (found != -stored * self.packed_bytes)).any():
+            return None
+        extra_at = [mask_at + _LEAF_MASK + 1 for mask_at in masks_at]
+        blocks = zip(modes, extra_at, stored.tolist(), data_at, lengths, strict=True)
+        return masks_at, list(blocks), at
 
     def read(self, blocks: Sequence[Block], active: NDArray[np.bool_], out: NDArray[Any]) -> None:
         """Unpack blocks of one size into ``out``, (n, size) or (n, size, 3).
@@ -253,7 +306,7 @@ class BlockCodec:
             if length <= 0:
                 view[done : done + size] = data[at : at + size]
             elif self.blosc:
-                _blosc_into(data[at : at + length], address + done, size, at)
+                _blosc_into(data, at, length, address + done, size)
             else:
                 view[done : done + size] = _unzip(data[at : at + length], size, at)
             done += size
@@ -287,7 +340,8 @@ class BlockCodec:
 
     def gather(self, at: NDArray[np.int64], size: int) -> NDArray[np.uint8]:
         """The ``size`` bytes at each of n positions: (n, size)."""
-        return np.frombuffer(self.data, np.uint8)[at[:, None] + np.arange(size)]
+        windows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(self.data, np.uint8), size)
+        return windows[at]
 
     def _values_at(self, at: NDArray[np.int64]) -> NDArray[Any]:
         raw = self.gather(at, self.kind.stored_bytes).view(self.kind.stored)
@@ -305,15 +359,15 @@ class BlockCodec:
         return 1 - self.background if self.is_bool else -np.atleast_1d(self.background)
 
 
-def _blosc_into(chunk: memoryview, address: int, size: int, at: int) -> None:
-    """Decompress one blosc chunk to ``address``, where there is room for ``size`` bytes."""
-    if len(chunk) < _BLOSC_HEADER:
-        raise Damage(at, f"a blosc chunk of {len(chunk)} bytes")
-    unpacked, _, packed = _BLOSC_SIZES.unpack_from(chunk)
-    if unpacked != size or packed > len(chunk):
+def _blosc_into(data: memoryview, at: int, length: int, address: int, size: int) -> None:
+    """Decompress the blosc chunk at ``at`` to ``address``, where there is room for ``size``."""
+    if length < _BLOSC_HEADER:
+        raise Damage(at, f"a blosc chunk of {length} bytes")
+    unpacked, _, packed = _BLOSC_SIZES.unpack_from(data, at)
+    if unpacked != size or packed > length:
         raise Damage(at, f"a blosc chunk of {unpacked} bytes where the node has {size}")
     try:
-        written = blosc.decompress_ptr(chunk[:packed], address)
+        written = decompress_ptr(data[at : at + packed], address)
     except Exception as error:  # the type is not public
         raise Damage(at, "a blosc chunk that cannot be decompressed") from error
     if written != size:

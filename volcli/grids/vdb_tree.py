@@ -9,6 +9,7 @@ A block is `vdb_codec`'s; files, grids and their headers are `vdb`'s.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from struct import Struct
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from volcli.grids.threads import in_threads
 from volcli.grids.tree import Progress, Tree
 from volcli.grids.vdb_codec import Block, BlockCodec, Cursor, Damage, Mode, unpack_bits
 
@@ -146,6 +148,10 @@ def _locate_leaves(
     cursor: Cursor, codec: BlockCodec, origins: NDArray[np.int32]
 ) -> tuple[list[int], list[Block]]:
     """Find the masks and the blocks of the leaves that follow, and leave the cursor behind them."""
+    quick = codec.locate_leaves(cursor.at, len(origins))
+    if quick is not None:
+        masks_at, blocks, cursor.at = quick
+        return masks_at, blocks
     masks_at, blocks = [], []
     data, locate, end, at = cursor.data, codec.locate, cursor.end, cursor.at
     # The mask is followed by the block, or up to version 221 by an origin and a buffer count.
@@ -189,14 +195,29 @@ def read_tree(cursor: Cursor, codec: BlockCodec, progress: Progress | None) -> T
     cursor.need(count * least, f"{count} leaves")
     masks = np.empty((count, _LEAF_MASK), np.uint8)
     values = np.empty((count, _LEAF_VOXELS, *kind.shape), kind.dtype)
-    for start in range(0, count, _LEAVES_AT_ONCE):
-        part = slice(start, min(start + _LEAVES_AT_ONCE, count))
-        if codec.fixed_leaf_bytes is not None:
-            _read_bit_leaves(cursor, codec.fixed_leaf_bytes, masks[part], values[part])
-        else:
+    starts = range(0, count, _LEAVES_AT_ONCE)
+    parts = [slice(start, min(start + _LEAVES_AT_ONCE, count)) for start in starts]
+
+    def located() -> Iterator[tuple[slice, list[Block]]]:
+        for part in parts:
             masks_at, blocks = _locate_leaves(cursor, codec, origins[part])
             masks[part] = codec.gather(np.array(masks_at), _LEAF_MASK)
-            codec.read(blocks, unpack_bits(masks[part]), values[part])
+            yield part, blocks
+
+    def unpack(part_and_blocks: tuple[slice, list[Block]]) -> None:
+        part, blocks = part_and_blocks
+        codec.read(blocks, unpack_bits(masks[part]), values[part])
+
+    def read_bits(part: slice) -> None:
+        _read_bit_leaves(cursor, codec.fixed_leaf_bytes or 0, masks[part], values[part])
+
+    if codec.fixed_leaf_bytes is not None:
+        work: Iterable[None] = map(read_bits, parts)
+    elif codec.gains_from_threads:
+        work = in_threads(unpack, located())
+    else:
+        work = map(unpack, located())
+    for part, _ in zip(parts, work, strict=True):
         if progress is not None:
             progress(part.stop, count)
     return Tree(
