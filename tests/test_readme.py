@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import re
 import shlex
 import tomllib
@@ -40,7 +41,7 @@ def test_the_readme_has_examples():
 
 @pytest.mark.needs_jit
 @pytest.mark.parametrize("command", commands())
-def test_each_command_of_the_readme_does_what_it_says(command, checkout):
+def test_each_command_of_the_readme_does_what_the_text_beside_it_says(command, checkout):
     words = shlex.split(command)[1:]
     if words[0] == "render":  # small: what is tested is that it runs, not the picture
         words += ["--size", "64x48"]
@@ -49,8 +50,17 @@ def test_each_command_of_the_readme_does_what_it_says(command, checkout):
     if "-o" in words:
         written = checkout / words[words.index("-o") + 1]
         assert written.stat().st_size > 0
+    if "--maps" in words:
+        for name in words[words.index("--maps") + 1].split(","):
+            assert written.with_suffix(f".{name}.png").stat().st_size > 0
+    if "--json" in words:
+        assert json.loads(ran.out)
+    elif "--explain" in words:
+        assert ran.out.startswith("term")
     else:
         assert ran.out
+    if "--eye" not in words and words[1].endswith(".vdb") and words[0] == "render":
+        assert "camera chosen: --eye" in ran.err
 
 
 def test_the_job_file_of_the_readme_is_a_job_that_names_every_part():

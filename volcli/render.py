@@ -240,7 +240,7 @@ def _check_step(grid: BrickGrid, plan: Plan) -> None:
     if longest / plan.step_voxels > MAX_STEPS:
         raise UsageError(
             f"--step {plan.step_voxels:g}: up to {longest / plan.step_voxels:.0e} samples a ray; "
-            f"give at least {1.1 * longest / MAX_STEPS:.1e} voxels, or leave it out: exact is faster"
+            f"give at least {1.1 * longest / MAX_STEPS:.1e} voxels, or none: exact is faster"
         )
 
 

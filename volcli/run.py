@@ -6,7 +6,6 @@ results go to the caller.
 
 from __future__ import annotations
 
-import resource
 import sys
 import time
 from collections.abc import Callable
@@ -20,7 +19,7 @@ import volcli
 from volcli import images
 from volcli.camera import Camera, make_camera
 from volcli.config import job_as_toml
-from volcli.errors import OutputError, UsageError
+from volcli.errors import UsageError
 from volcli.grids import (
     BrickGrid,
     GridHeader,
@@ -33,6 +32,9 @@ from volcli.grids import (
 from volcli.plan import Plan, make_plan
 from volcli.render import RenderResult, Scene, over, render
 from volcli.schema import Job
+
+UNKNOWN_BOX = np.array([[-1.0] * 3, [1.0] * 3])
+"""(2, 3) world units: what is framed where there is no volume to frame."""
 
 OnStage = Callable[[str, int, int], None]
 """Called as ``on_stage(stage, done, total)``; a stage is one of ``reading GRID``, ``compiling``,
@@ -123,11 +125,11 @@ def prepare(job: Job, *, overwrite: bool = True, writes: bool = True) -> Prepare
     if writes and not files:
         raise UsageError("nothing to write: give -o OUT.exr (or output.image in the job)")
     for path in files.values():
-        if path.is_dir():
-            raise OutputError(f"{path}: is a folder; name a file inside it, such as picture.exr")
         images.check_output(path, overwrite=overwrite)
     if job.density.file is None:
         raise UsageError("no volume: the job has no density.file; give one")
+    if job.camera.eye is not None and job.camera.target is not None:
+        make_camera(job.camera, UNKNOWN_BOX)  # raises now what needs no volume to be known
     volume = open_volume(job.density.file, job.density.reader)
     layers = {"picture", *job.output.maps}
     if not files or files["picture"].suffix.lower() == ".exr":
@@ -182,7 +184,7 @@ def run(
         frame.
     """
     plan, density = prepared.plan, loaded.density
-    box = np.array([[-1.0] * 3, [1.0] * 3]) if density.is_empty else density.world_box()
+    box = UNKNOWN_BOX if density.is_empty else density.world_box()
     job = _resolved(prepared.job, make_camera(prepared.job.camera, box))
     # Made anew from what was chosen, so that the job in the header gives the same rays to the bit.
     camera = make_camera(job.camera, box)
@@ -225,6 +227,8 @@ def run(
 
 def peak_memory_bytes() -> int:
     """The most memory that this process has held."""
+    import resource  # not on Windows, which volcli has not been tried on
+
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
 
@@ -288,7 +292,9 @@ def _write(
             values = layers[name]
             assert values is not None, "the plan evaluates what is written"
             low, high = images.write_map(path, values, header, name=name, overwrite=overwrite)
-            maps[name] = {"file": str(path), "black": low, "white": high}
+            maps[name] = {"file": str(path)}
+            if path.suffix.lower() == ".png":
+                maps[name] |= {"black": low, "white": high}
             continue
         picture = over(result, prepared.background)
         if path.suffix.lower() == ".png":

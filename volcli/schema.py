@@ -124,7 +124,8 @@ class Quadrature(_Part):
     )
     step: Positive | None = Field(
         None,
-        description=f"Step of the midpoint rule, in voxels. Absent: {DEFAULT_STEP}.",
+        description="Step of the midpoint rule, in voxels; without it the rule is exact "
+        f"(a job that names midpoint and no step takes {DEFAULT_STEP}).",
     )
 
     @model_validator(mode="after")

@@ -29,7 +29,7 @@ def _written(default: Any) -> str:
     return joint.join(f"{v:g}" for v in default)
 
 
-def numbers(flag: str, text: str | None, count: int = 3) -> tuple[float, ...] | None:
+def numbers(flag: str, text: str | None) -> tuple[float, ...] | None:
     """``X,Y,Z`` to numbers; None stays None.
 
     Raises
@@ -43,10 +43,8 @@ def numbers(flag: str, text: str | None, count: int = 3) -> tuple[float, ...] | 
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
         values = ()
-    if len(values) != count or not all(math.isfinite(v) for v in values):
-        raise UsageError(
-            f"{flag} {text}: give {count} finite numbers separated by commas, such as 0,1,0"
-        )
+    if len(values) != 3 or not all(math.isfinite(v) for v in values):
+        raise UsageError(f"{flag} {text}: give 3 finite numbers separated by commas, such as 0,1,0")
     return values
 
 

@@ -75,7 +75,8 @@ def render(
         bool,
         typer.Option(
             "--explain",
-            help="Print what is read and evaluated, and why. Without -o, do no more than that.",
+            help="Print what is read and evaluated, and why. Without an output (-o, or one in the "
+            "job) grids are read, and nothing is rendered.",
         ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
@@ -143,7 +144,7 @@ def render(
         report = run(prepared, loaded, threads=threads, overwrite=overwrite, on_stage=bars)
 
     _warn(report.warnings)
-    if not quiet and not as_json and None in (job.camera.eye, job.camera.target):
+    if not quiet and None in (job.camera.eye, job.camera.target):
         print(f"volcli: camera chosen: {_camera_flags(report.camera)}", file=sys.stderr)
     if as_json:
         printed = asdict(report)
@@ -188,7 +189,9 @@ def _camera_flags(camera: dict[str, Any]) -> str:
     """A camera as the flags that ask for it."""
     eye, target = (",".join(f"{v:.6g}" for v in camera[name]) for name in ("eye", "target"))
     lens = f"--ortho {camera['width']:.6g}" if "width" in camera else f"--fov {camera['fov']:g}"
-    return f"--eye {eye} --target {target} {lens}"
+    up = ",".join(f"{v:.6g}" for v in camera["up"])
+    tilt = "" if up == "0,1,0" else f" --up {up}"
+    return f"--eye {eye} --target {target}{tilt} {lens}"
 
 
 def _summary(report: Report) -> str:
@@ -196,7 +199,7 @@ def _summary(report: Report) -> str:
     lines = [f"{report.image}  picture {width}x{height}"]
     for name, written in report.maps.items():
         scale = ""
-        if (written["black"], written["white"]) != (0.0, 1.0):
+        if (written.get("black", 0.0), written.get("white", 1.0)) != (0.0, 1.0):
             scale = f", black is {written['black']:g}, white is {written['white']:g}"
         lines.append(f"{written['file']}  {name}{scale}")
     t, s = report.transmittance, report.seconds

@@ -26,6 +26,8 @@ def check_output(path: str | os.PathLike[str], *, overwrite: bool = True) -> Non
         file; or it exists and ``overwrite`` is False.
     """
     path = Path(path)
+    if os.path.isdir(path):  # noqa: PTH112 - Path.is_dir raises where a name is too long
+        raise OutputError(f"{path}: is a folder; name a file inside it, such as picture.exr")
     if path.suffix.lower() not in (".exr", ".png"):
         raise UsageError(f"{path}: unknown image format '{path.suffix}'; use .exr or .png")
     folder = path.parent
@@ -39,8 +41,6 @@ def check_output(path: str | os.PathLike[str], *, overwrite: bool = True) -> Non
     if not stat.S_ISDIR(folder_mode):
         raise OutputError(f"{path}: '{folder}' is not a folder; choose another path")
     if mode is not None:
-        if stat.S_ISDIR(mode):
-            raise OutputError(f"{path}: is a folder; name a file inside it")
         if not stat.S_ISREG(mode):
             raise OutputError(f"{path}: is not a regular file; choose another path")
         if not overwrite:
