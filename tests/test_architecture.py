@@ -204,6 +204,7 @@ def test_an_option_that_sets_a_field_has_the_help_of_the_schema_and_no_default_o
         "background",
         "settings",
         "threads",
+        "cache",
         "overwrite",
         "explain",
         "as_json",

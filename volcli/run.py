@@ -143,8 +143,17 @@ def prepare(job: Job, *, overwrite: bool = True, writes: bool = True) -> Prepare
     return Prepared(job, volume, plan, files, background)
 
 
-def load(prepared: Prepared, on_stage: OnStage = lambda stage, done, total: None) -> Loaded:
+def load(
+    prepared: Prepared,
+    on_stage: OnStage = lambda stage, done, total: None,
+    cache: Path | None = None,
+) -> Loaded:
     """Read the grids that the plan names.
+
+    Parameters
+    ----------
+    cache
+        A folder that keeps bricks from one load to the next.
 
     Raises
     ------
@@ -158,12 +167,14 @@ def load(prepared: Prepared, on_stage: OnStage = lambda stage, done, total: None
 
     begin = time.perf_counter()
     density, warnings = load_density(
-        volume, plan.density, job.density.nonfinite, progress(plan.density)
+        volume, plan.density, job.density.nonfinite, progress(plan.density), cache
     )
     color: BrickGrid | tuple[float, float, float] = job.color.value
     if plan.color is not None:
-        color, notes = load_color(volume, plan.color, job.density.nonfinite, progress(plan.color))
-        warnings = [*warnings, *notes]
+        color, notes = load_color(
+            volume, plan.color, job.density.nonfinite, progress(plan.color), cache
+        )
+        warnings = [*warnings, *(note for note in notes if note not in warnings)]
     return Loaded(density, color, tuple(warnings), time.perf_counter() - begin)
 
 

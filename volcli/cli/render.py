@@ -70,6 +70,15 @@ def render(
         int | None,
         typer.Option(min=1, metavar="N", help="Threads. [default: the processors there are]"),
     ] = None,
+    cache: Annotated[
+        Path | None,
+        typer.Option(
+            "--cache",
+            metavar="DIR",
+            help="Folder that keeps what is made of a volume, so that its next picture loads at "
+            "once. [default: none]",
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option(help="Whether files that exist are replaced.")] = True,
     explain: Annotated[
         bool,
@@ -128,7 +137,7 @@ def render(
     )
     prepared = prepare(job, overwrite=overwrite, writes=not explain)
     with Bars(quiet) as bars:
-        loaded = load(prepared, bars)
+        loaded = load(prepared, bars, cache)
         held = {prepared.plan.density.label: loaded.density.nbytes}
         if prepared.plan.color is not None and not isinstance(loaded.color, tuple):
             held[prepared.plan.color.label] = loaded.color.nbytes

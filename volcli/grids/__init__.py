@@ -8,6 +8,7 @@ load(volume, header)       that grid as bricks
 from __future__ import annotations
 
 import difflib
+from collections.abc import Callable
 from pathlib import Path
 
 from volcli.errors import VolumeError
@@ -30,6 +31,8 @@ __all__ = [
 
 DENSITY = "density"
 """The name by which a file says which of its grids is the density."""
+
+_Reading = Callable[[Volume, GridHeader, str, Progress | None], tuple[BrickGrid, list[str]]]
 
 LEVEL_SET = "level set"
 """The class of grids that hold distances to a surface."""
@@ -150,15 +153,69 @@ def color_grid(volume: Volume, name: str) -> tuple[GridHeader, list[str]]:
 
 
 def load_density(
-    volume: Volume, header: GridHeader, nonfinite: str, progress: Progress | None = None
+    volume: Volume,
+    header: GridHeader,
+    nonfinite: str,
+    progress: Progress | None = None,
+    cache: Path | None = None,
 ) -> tuple[BrickGrid, list[str]]:
     """Read a grid as a density (values below 0 become 0), with warnings on what was changed.
+
+    Parameters
+    ----------
+    nonfinite
+        What NaN and Inf are: ``error``, or ``zero``.
+    cache
+        A folder that keeps bricks from one load to the next.
 
     Raises
     ------
     VolumeError
         If the file is damaged, or holds NaN or Inf and ``nonfinite`` is ``error``.
     """
+    return _load(_read_density, volume, header, nonfinite, progress, cache)
+
+
+def load_color(
+    volume: Volume,
+    header: GridHeader,
+    nonfinite: str,
+    progress: Progress | None = None,
+    cache: Path | None = None,
+) -> tuple[BrickGrid, list[str]]:
+    """Read a grid as a colour. Values below 0 are kept; the model is linear in them.
+
+    Parameters, and what is raised, are those of `load_density`.
+    """
+    return _load(_read_color, volume, header, nonfinite, progress, cache)
+
+
+def _load(
+    read: _Reading,
+    volume: Volume,
+    header: GridHeader,
+    nonfinite: str,
+    progress: Progress | None,
+    cache: Path | None,
+) -> tuple[BrickGrid, list[str]]:
+    """A grid by way of the cache, if there is one."""
+    if cache is None:
+        return read(volume, header, nonfinite, progress)
+    from volcli.grids.cache import through_cache
+
+    settings = (type(volume).__name__, read.__name__, nonfinite)
+    return through_cache(
+        cache,
+        volume.path,
+        header.label,
+        settings,
+        lambda: read(volume, header, nonfinite, progress),
+    )
+
+
+def _read_density(
+    volume: Volume, header: GridHeader, nonfinite: str, progress: Progress | None
+) -> tuple[BrickGrid, list[str]]:
     where = f"{volume.path}: grid '{header.label}'"
     tree, notes = settle_nonfinite(volume.read_tree(header, progress), where, nonfinite)
     tree, clamped = clamp_negative(tree, where)
@@ -172,16 +229,9 @@ def load_density(
     return grid, notes + clamped
 
 
-def load_color(
-    volume: Volume, header: GridHeader, nonfinite: str, progress: Progress | None = None
+def _read_color(
+    volume: Volume, header: GridHeader, nonfinite: str, progress: Progress | None
 ) -> tuple[BrickGrid, list[str]]:
-    """Read a grid as a colour. Values below 0 are kept; the model is linear in them.
-
-    Raises
-    ------
-    VolumeError
-        If the file is damaged, or holds NaN or Inf and ``nonfinite`` is ``error``.
-    """
     where = f"{volume.path}: grid '{header.label}'"
     tree, notes = settle_nonfinite(volume.read_tree(header, progress), where, nonfinite)
     return build(tree, header), notes

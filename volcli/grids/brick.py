@@ -28,6 +28,9 @@ from numpy.typing import NDArray
 
 from volcli.grids.tree import GridHeader, Tree
 
+FORMAT = 1
+"""Goes up with every change of what `build` makes of a tree: bricks kept in a cache then do too."""
+
 BRICK = 8
 APRON = BRICK + 1
 LOWER = 16
