@@ -22,11 +22,16 @@ lint: $(SETUP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Takes some minutes; render and load need OpenVDB (Debian: python3-openvdb, libopenvdb-tools).
+# Takes a quarter of an hour on an idle machine. Volumes are made by OpenVDB, beside whose vdb_render
+# volcli is measured (Debian: python3-openvdb, libopenvdb-tools). Mitsuba compiles with an LLVM of 16
+# or newer, which DRJIT_LIBLLVM_PATH can name, and otherwise runs without.
 bench: $(SETUP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
 	$(BIN)/python -m benchmarks.accuracy
 	$(BIN)/python -m benchmarks.load
 	$(BIN)/python -m benchmarks.render
+	$(BIN)/python -m benchmarks.peers
+	$(BIN)/python -m benchmarks.scaling
 	$(BIN)/python -m benchmarks.report
 
 # The README's pictures.

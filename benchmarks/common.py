@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from volcli import __version__
 from volcli.grids.pyopenvdb import find_interpreter
 
@@ -47,12 +49,58 @@ vdb.write(path, [grid])
 """
 """Run by an interpreter that has OpenVDB, since the files are to be OpenVDB's own."""
 
+MAKE_DENSE = """
+import json, sys
+import numpy as np
+try:
+    import openvdb as vdb
+except ImportError:
+    import pyopenvdb as vdb
+
+grid = vdb.read(sys.argv[1], "density")
+low, high = grid.evalActiveVoxelBoundingBox()
+low, high = [v - 1 for v in low], [v + 1 for v in high]
+array = np.empty([h - l + 1 for l, h in zip(low, high)], np.float32)
+grid.copyToArray(array, ijk=low)
+np.save(sys.argv[2], np.ascontiguousarray(array.transpose(2, 1, 0)))
+print(json.dumps(low))
+"""
+"""The active box and a voxel around it as an array in the order (z, y, x)."""
+
+PEAK_BYTES = """
+def peak_bytes():
+    with open("/proc/self/status") as file:
+        return next(int(line.split()[1]) for line in file if line.startswith("VmHWM:")) * 1024
+"""
+"""The peak memory of this very program: ru_maxrss would count what the one that started it held."""
+
 
 def make_cloud(path: Path, size: int, threshold: float) -> Path:
     """A cloud of ``size``^3 voxels in a .vdb file, written by OpenVDB itself."""
-    command = [find_interpreter(), "-I", "-c", MAKE_CLOUD, str(path), str(size), str(threshold)]
-    subprocess.run(command, check=True, env={"PATH": os.environ.get("PATH", "")})
+    _openvdb(MAKE_CLOUD, path, size, threshold)
     return path
+
+
+def make_dense(path: Path, out: Path) -> tuple[int, int, int]:
+    """The density of a .vdb file as a (z, y, x) array in ``out``; the lattice point of its first.
+
+    A voxel of background lies around it, so that linear interpolation ends as it does in a grid.
+    """
+    x, y, z = json.loads(_openvdb(MAKE_DENSE, path, out))
+    return x, y, z
+
+
+def _openvdb(program: str, *arguments: object) -> str:
+    command = [find_interpreter(), "-I", "-c", program, *map(str, arguments)]
+    clean = {"PATH": os.environ.get("PATH", "")}
+    return subprocess.run(command, check=True, env=clean, stdout=subprocess.PIPE, text=True).stdout
+
+
+def view_of(box: Any, fov: float) -> tuple[Any, Any]:
+    """Eye and target from which a world box fills most of a square picture."""
+    center, radius = box.mean(axis=0), np.linalg.norm(box[1] - box[0]) / 2
+    eye = center + np.array([0.55, 0.4, 0.73]) * radius / np.tan(np.radians(fov / 2)) * 1.05
+    return eye, center
 
 
 def summary(seconds: Sequence[float]) -> dict[str, float]:

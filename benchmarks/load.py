@@ -19,13 +19,15 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common import make_cloud, summary, write_results
+from benchmarks.common import PEAK_BYTES, make_cloud, summary, write_results
 from volcli.grids.pyopenvdb import find_interpreter
 
 ROUNDS = 7
 
-OURS = """
-import json, resource, sys, time
+OURS = (
+    PEAK_BYTES
+    + """
+import json, sys, time
 from pathlib import Path
 import numpy.ma
 import volcli.grids.vdb
@@ -36,12 +38,14 @@ def load():
     grid, _ = load_density(volume, density_grid(volume, None)[0], "error")
     return time.perf_counter() - begin, grid
 seconds, grid = min((load() for _ in range(3)), key=lambda done: done[0])
-peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-print(json.dumps({"seconds": seconds, "peak": peak, "held": grid.nbytes}))
+print(json.dumps({"seconds": seconds, "peak": peak_bytes(), "held": grid.nbytes}))
 """
+)
 
-THEIRS = """
-import json, resource, sys, time
+THEIRS = (
+    PEAK_BYTES
+    + """
+import json, sys, time
 import numpy as np
 try:
     import openvdb as vdb
@@ -55,9 +59,10 @@ def load():
     grid.copyToArray(array, ijk=low)
     return time.perf_counter() - begin, grid
 seconds, grid = min((load() for _ in range(3)), key=lambda done: done[0])
-peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-print(json.dumps({"seconds": seconds, "peak": peak, "voxels": int(grid.activeVoxelCount())}))
+voxels = int(grid.activeVoxelCount())
+print(json.dumps({"seconds": seconds, "peak": peak_bytes(), "voxels": voxels}))
 """
+)
 
 
 def run(command: list[str], env: dict[str, str] | None = None) -> dict[str, Any]:

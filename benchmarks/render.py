@@ -15,12 +15,14 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.common import make_cloud, summary, write_results
+from benchmarks.common import make_cloud, summary, view_of, write_results
 from volcli import images, schema
 from volcli.camera import make_camera
 from volcli.grids import density_grid, load_density, open_volume
@@ -46,8 +48,7 @@ def compare(path: Path) -> dict[str, Any]:
     grid, _ = load_density(volume, header, "error")
     voxel = float(np.linalg.norm(grid.world_from_index[:3, 0]))
     box = grid.world_box()
-    center, radius = box.mean(axis=0), np.linalg.norm(box[1] - box[0]) / 2
-    eye = center + np.array([0.55, 0.4, 0.73]) * radius / np.tan(np.radians(FOV / 2)) * 1.05
+    eye, center = view_of(box, FOV)
     scene = Scene(grid, SIGMA_PER_VOXEL / voxel, (1.0, 1.0, 1.0))
     camera = make_camera(
         schema.Camera(eye=tuple(eye), target=tuple(center), fov=FOV, resolution=(SIZE, SIZE)),
@@ -71,9 +72,9 @@ def compare(path: Path) -> dict[str, Any]:
         for name, plan in runs.items():
             times[name].append(render(scene, plan, camera).render_seconds)
         if tool:
-            seconds, seen = _vdb_render(tool, path, eye, center)
-            times["vdb_render -step 1"].append(seconds)
-            opacity["vdb_render -step 1"] = seen
+            ran = vdb_render(path, eye, center)
+            times["vdb_render -step 1"].append(ran.seconds)
+            opacity["vdb_render -step 1"] = ran.opacity
 
     truth = opacity["volcli exact, opacity"]
     rows = {}
@@ -89,25 +90,55 @@ def compare(path: Path) -> dict[str, Any]:
     return {"voxels": header.active_voxels, "bricks": len(grid.arrays.atlas), "runs": rows}
 
 
-def _vdb_render(tool: str, path: Path, eye: Any, center: Any) -> tuple[float, Any]:
-    """One run of vdb_render: its own ray-tracing time, and the alpha it wrote."""
+@dataclass(frozen=True)
+class VdbRender:
+    """One run of vdb_render: its own ray-tracing time, the whole, peak memory, and its alpha."""
+
+    seconds: float
+    whole_seconds: float
+    peak_bytes: int
+    opacity: Any
+
+
+def vdb_render(
+    path: Path,
+    eye: Any,
+    center: Any,
+    *,
+    step: float = 1.0,
+    cutoff: float | None = None,
+    size: int = SIZE,
+    threads: int | None = None,
+) -> VdbRender:
+    """Run vdb_render; a ``cutoff`` of None is its own default."""
     with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "out.exr"
+        out, log = Path(folder) / "out.exr", Path(folder) / "log.txt"
         absorb = ",".join([str(SIGMA_PER_VOXEL)] * 3)
-        command = [tool, str(path), str(out), "-v", "-res", f"{SIZE}x{SIZE}", "-fov", str(FOV)]
-        command += ["-translate", ",".join(map(str, eye)), "-lookat", ",".join(map(str, center))]
-        command += ["-absorb", absorb, "-scatter", "0,0,0", "-step", "1", "-name", "density"]
-        command += ["-cpus", str(available_threads()), "-compression", "none"]
-        done = subprocess.run(command, check=True, capture_output=True, text=True)
-        found = re.search(
-            r"ray-tracing.*?completed in ([\d.]+) (\w+)", done.stderr + done.stdout, re.S
-        )
-        assert found, f"vdb_render -v printed no time: {done.stdout}{done.stderr}"
-        unit = {"sec": 1.0, "ms": 1e-3, "min": 60.0}[
-            found[2].rstrip("s") if found[2] != "ms" else "ms"
-        ]
+        command = ["vdb_render", str(path), str(out), "-v", "-res", f"{size}x{size}"]
+        command += ["-fov", str(FOV), "-translate", ",".join(map(str, eye))]
+        command += ["-lookat", ",".join(map(str, center)), "-absorb", absorb, "-scatter", "0,0,0"]
+        command += ["-step", str(step), "-name", "density", "-compression", "none"]
+        command += ["-cpus", str(threads or available_threads())]
+        if cutoff is not None:
+            command += ["-cutoff", str(cutoff)]
+        begin = time.perf_counter()
+        with log.open("w") as file:
+            process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
+        peak = 0
+        status = Path(f"/proc/{process.pid}/status")
+        while process.poll() is None:
+            if status.exists():
+                found = re.search(r"VmHWM:\s+(\d+)", status.read_text())
+                peak = int(found[1]) * 1024 if found else peak
+            time.sleep(0.005)
+        whole = time.perf_counter() - begin
+        said = log.read_text()
+        assert process.returncode == 0, said
+        found = re.search(r"ray-tracing.*?completed in ([\d.]+) (ms|sec|min)", said, re.S)
+        assert found, f"vdb_render -v printed no time: {said}"
+        unit = {"sec": 1.0, "ms": 1e-3, "min": 60.0}[found[2]]
         channels, _ = images.read_exr(out)
-        return float(found[1]) * unit, channels["A"]
+        return VdbRender(float(found[1]) * unit, whole, peak, channels["A"])
 
 
 def main(arguments: list[str]) -> None:

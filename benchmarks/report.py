@@ -76,6 +76,70 @@ def load(results: dict[str, Any]) -> str:
     )
 
 
+def peers(results: dict[str, Any]) -> str:
+    """All renderers and settings."""
+    rows = [["", "median (least to most)", "error, max", "rms", "start, load, first", "peak"]]
+    absent = []
+    for name, peer in results["peers"].items():
+        if "settings" not in peer:
+            absent.append(f"{name}: {peer.get('missing')}.")
+            continue
+        parts = [
+            f"{peer[key]['median']:.2f}" if key in peer else "-"
+            for key in ("import_seconds", "load_seconds", "first_seconds")
+        ]
+        once = [" + ".join(parts) + " s", f"{peer['peak_bytes'] / 1e6:.0f} MB"]
+        for label, row in peer["settings"].items():
+            seconds = row["seconds"]
+            rows.append(
+                [
+                    f"{name} {label}",
+                    f"{seconds['median'] * 1e3:.0f} ms "
+                    f"({seconds['min'] * 1e3:.0f} to {seconds['max'] * 1e3:.0f})",
+                    _error(row["opacity_error"]["max"]),
+                    _error(row["opacity_error"]["rms"]),
+                    *once,
+                ]
+            )
+            once = ["", ""]
+    versions = (
+        f"{name} {peer['version']}"
+        for name, peer in results["peers"].items()
+        if "settings" in peer and name != "volcli"
+    )
+    lines = [
+        f"{results['voxels']:,} voxels, {results['pixels']} x {results['pixels']} rays, "
+        f"{results['machine']['threads']} threads.",
+        "; ".join(versions) + ".",
+        *absent,
+    ]
+    return _markdown(rows) + "\n\n" + "\n".join(lines)
+
+
+def scaling(results: dict[str, Any]) -> str:
+    """Lines through times and sizes."""
+    fits, voxels, pixels = results["fits"], results["voxels"], results["pixels"]
+    rows = [["active voxels", "pixels", "cells visited", "seconds on 1 thread", "on 2", "peak"]]
+    seen: dict[tuple[int, int], dict[int, dict[str, Any]]] = {}
+    for row in (*voxels, *pixels):
+        seen.setdefault((row["active_voxels"], row["pixels"]), {})[row["threads"]] = row
+    for (active, size), by in seen.items():
+        times = [f"{by[n]['seconds']['median']:.3f}" if n in by else "-" for n in (1, 2)]
+        cells, peak = f"{by[1]['cells']:,}", f"{by[1]['peak_bytes'] / 1e6:.0f} MB"
+        rows.append([f"{active:,}", f"{size:,}", cells, *times, peak])
+    of_cells = [
+        f"{1e-6 / line['slope']:.0f} M cells/s on {n} thread{'' if n == '1' else 's'} "
+        f"(measurements within {100 * line['worst']:.0f} %)"
+        for n, line in fits["seconds_of_cells"].items()
+    ]
+    held, peak = fits["held_bytes_of_voxels"], fits["peak_bytes_of_pixels"]
+    return (
+        f"{_markdown(rows)}\n\nA line through times over cells visited:\n{',\n'.join(of_cells)}.\n"
+        f"Bricks take {held['slope']:.1f} bytes an active voxel "
+        f"(within {100 * held['worst']:.0f} %), pictures {peak['slope']:.0f} bytes a pixel."
+    )
+
+
 def _error(value: float | None) -> str:
     return "-" if value is None else f"{value:.0e}".replace("e-0", "e-")
 
@@ -88,7 +152,7 @@ def _markdown(rows: list[list[str]]) -> str:
 def main() -> None:
     """Rewrite the README's results."""
     text = README.read_text(encoding="utf-8")
-    for make in (accuracy, render, load):
+    for make in (accuracy, peers, render, load, scaling):
         name = make.__name__
         results = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
         block = f"<!-- {name} -->\n{make(results)}\n<!-- /{name} -->"
