@@ -132,9 +132,10 @@ def scaling(results: dict[str, Any]) -> str:
         f"(measurements within {100 * line['worst']:.0f} %)"
         for n, line in fits["seconds_of_cells"].items()
     ]
+    rates = ",\n".join(of_cells)
     held, peak = fits["held_bytes_of_voxels"], fits["peak_bytes_of_pixels"]
     return (
-        f"{_markdown(rows)}\n\nA line through times over cells visited:\n{',\n'.join(of_cells)}.\n"
+        f"{_markdown(rows)}\n\nA line through times over cells visited:\n{rates}.\n"
         f"Bricks take {held['slope']:.1f} bytes an active voxel "
         f"(within {100 * held['worst']:.0f} %), pictures {peak['slope']:.0f} bytes a pixel."
     )
