@@ -23,8 +23,8 @@ lint: $(SETUP)
 	$(BIN)/mypy
 
 # Takes a quarter of an hour on an idle machine. Volumes are made by OpenVDB, beside whose vdb_render
-# volcli is measured (Debian: python3-openvdb, libopenvdb-tools). Mitsuba compiles with an LLVM of 16
-# or newer, which DRJIT_LIBLLVM_PATH can name, and otherwise runs without.
+# volcli is measured (Debian: python3-openvdb, libopenvdb-tools). Mitsuba compiles with an LLVM
+# newer than 15 (tried: 22), which DRJIT_LIBLLVM_PATH can name, and otherwise runs without.
 bench: $(SETUP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
 	$(BIN)/python -m benchmarks.accuracy

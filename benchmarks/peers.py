@@ -39,7 +39,7 @@ from volcli.render import Scene, available_threads, make_integrator
 
 STARTS = 3
 SETTING_SECONDS = 10.0
-"""A setting gets no more rounds after this, and what is slower in its renderer is left out."""
+"""A setting gets no more rounds after this; where one takes as long, that one is what counts."""
 
 PATIENCE = 180.0
 """Seconds after which a renderer that does not answer is ended."""
