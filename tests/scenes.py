@@ -8,7 +8,7 @@ import numpy as np
 import reference
 
 from volcli.camera import make_camera
-from volcli.grids.brick import build
+from volcli.grids.build import build
 from volcli.grids.tree import GridHeader, Tree
 from volcli.plan import make_plan
 from volcli.render import Scene, render

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from volcli.grids import GridHeader, Tree, Volume, open_volume
-from volcli.grids.brick import build, to_world
+from volcli.grids.brick import to_world
+from volcli.grids.build import build
 from volcli.grids.values import settle_nonfinite
 
 

@@ -2,7 +2,7 @@
 
 open_volume(path)          a `Volume`: headers are read, voxels are not
 density_grid, color_grid   which grid a job means
-load(volume, header)       that grid as bricks
+load_density, load_color   that grid as bricks, fit to be rendered
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from volcli.errors import VolumeError
-from volcli.grids.brick import BrickGrid, build
+from volcli.grids.brick import BrickGrid
+from volcli.grids.build import build
 from volcli.grids.tree import GridHeader, Progress, Tree, Volume
 from volcli.grids.values import clamp_negative, settle_nonfinite
 
