@@ -13,6 +13,7 @@ Nothing here knows a tree, a header or the name of a file.
 
 from __future__ import annotations
 
+import itertools
 import struct
 import zlib
 from collections.abc import Sequence
@@ -277,31 +278,38 @@ class BlockCodec:
     def read(self, blocks: Sequence[Block], active: NDArray[np.bool_], out: NDArray[Any]) -> None:
         """Unpack blocks of one size into ``out``, (n, size) or (n, size, 3).
 
-        ``active`` is (n, size). Where all values are stored in their own type they are unpacked
-        in place; else the stored ones of all blocks go side by side into a scratch array first.
+        ``active`` is (n, size). Blocks that store all values, in their own type, are unpacked in
+        place; what the others store goes side by side into a scratch array first.
         """
-        total = sum(block[2] for block in blocks)
-        complete = total == active.size
-        in_place = complete and self.packed_dtype == out.dtype and out.flags.c_contiguous
-        packed = out if in_place else np.empty((total, *self.kind.shape), self.packed_dtype)
-        self._unpack(blocks, packed)
-        if in_place:
+        counts = np.array([block[2] for block in blocks])
+        whole = counts == active.shape[1]
+        if whole.any() and self.packed_dtype == out.dtype and out.flags.c_contiguous:
+            row_bytes = out.nbytes // len(out)
+            self._unpack(_chosen(blocks, whole), out, np.flatnonzero(whole) * row_bytes)
+            rest = np.flatnonzero(~whole)
+            if len(rest):
+                values = np.empty_like(out, shape=(len(rest), *out.shape[1:]))
+                self.read(_chosen(blocks, ~whole), active[rest], values)
+                out[rest] = values
             return
-        if complete:
+        packed = np.empty((counts.sum(), *self.kind.shape), self.packed_dtype)
+        self._unpack(blocks, packed, (np.cumsum(counts) - counts) * self.packed_bytes)
+        if whole.all():
             out[...] = packed.reshape(out.shape)
             return
         modes = np.array([block[0] for block in blocks])
         self._fill_inactive(blocks, modes, out)
         out[active | (modes == Mode.ALL_STORED)[:, None]] = packed
 
-    def _unpack(self, blocks: Sequence[Block], packed: NDArray[Any]) -> None:
-        """Decompress the data of blocks, one after the other, into the bytes of ``packed``."""
+    def _unpack(
+        self, blocks: Sequence[Block], packed: NDArray[Any], places: NDArray[np.int64]
+    ) -> None:
+        """Decompress the data of blocks into ``packed``, each from the byte at its place on."""
         data, item = self.data, self.packed_bytes
         target = packed.reshape(-1).view(np.uint8)
         address = target.ctypes.data
         view = memoryview(target)
-        done = 0
-        for _, _, count, at, length in blocks:
+        for (_, _, count, at, length), done in zip(blocks, places.tolist(), strict=True):
             size = count * item
             if length <= 0:
                 view[done : done + size] = data[at : at + size]
@@ -309,7 +317,6 @@ class BlockCodec:
                 _blosc_into(data, at, length, address + done, size)
             else:
                 view[done : done + size] = _unzip(data[at : at + length], size, at)
-            done += size
 
     def _fill_inactive(
         self, blocks: Sequence[Block], modes: NDArray[Any], out: NDArray[Any]
@@ -357,6 +364,10 @@ class BlockCodec:
 
     def _negative_background(self) -> NDArray[Any]:
         return 1 - self.background if self.is_bool else -np.atleast_1d(self.background)
+
+
+def _chosen(blocks: Sequence[Block], which: NDArray[np.bool_]) -> list[Block]:
+    return list(itertools.compress(blocks, which.tolist()))
 
 
 def _blosc_into(data: memoryview, at: int, length: int, address: int, size: int) -> None:
