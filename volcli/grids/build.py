@@ -22,12 +22,13 @@ from volcli.grids.brick import (
     BrickArrays,
     BrickGrid,
 )
+from volcli.grids.threads import in_threads
 from volcli.grids.tree import GridHeader, Tree
 
 _CHUNK = 16
 """Nodes refined at a time: bounds the memory of the work to some tens of MB."""
 
-_LEAVES = 256
+_LEAVES = 512
 """Leaves or bricks worked on at a time, so that what is made of them stays in the cache."""
 
 
@@ -285,10 +286,15 @@ def _background_parts(
 def _fill(
     signatures: NDArray[np.int32], values: NDArray[np.float32], constants: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """The atlas: for each brick, its leaf's values and the apron out of its + neighbours'."""
+    """The atlas: for each brick, its leaf's values and the apron out of its + neighbours'.
+
+    In threads, mostly so that fresh memory is touched for the first time by several at once: that
+    costs more than what is written.
+    """
     channels = values.shape[4:]
     atlas = np.empty((len(signatures), APRON, APRON, APRON, *channels), np.float32)
-    for start in range(0, len(signatures), _LEAVES):
+
+    def fill(start: int) -> None:
         rows, bricks = signatures[start : start + _LEAVES], atlas[start : start + _LEAVES]
         for corner, (x, y, z) in enumerate(CORNERS):
             region = bricks[:, _part(x, BRICK), _part(y, BRICK), _part(z, BRICK)]
@@ -297,6 +303,9 @@ def _fill(
             if len(constant) < len(entry):  # of a constant's leaf any, overwritten at once
                 region[...] = values[:, _read(x), _read(y), _read(z)][np.maximum(entry, 0)]
             region[constant] = constants[-1 - entry[constant]].reshape(-1, 1, 1, 1, *channels)
+
+    for _ in in_threads(fill, range(0, len(signatures), _LEAVES)):
+        pass
     return atlas.reshape(-1, APRON**3, *channels)
 
 
