@@ -1,8 +1,8 @@
 """Time and memory to a renderable grid, against OpenVDB reading the same file into an array.
 
-    python -m benchmarks.load [--large] [VOLUME.vdb ...]
+    python -m benchmarks.load [--large | VOLUME.vdb ...]
 
-``--large`` adds a ball of noise of 98 million voxels (341 MB, made in the temporary folder).
+``--large`` is a ball of noise of 98 million voxels (341 MB, made in the temporary folder).
 Each run is a process of its own that times itself: for volcli, reading a tree and building its
 bricks; for OpenVDB's Python module, reading the grid and copying its active box to a NumPy array;
 imports are not counted for either. Each process does so three times and counts the fastest: what
@@ -136,16 +136,16 @@ def compare(path: Path) -> dict[str, Any]:
 
 
 def main(arguments: list[str]) -> None:
-    """Compare on the files named, or on a cloud made for it."""
+    """Compare on the files named, or on a cloud or a ball made for it."""
     results = {}
     with tempfile.TemporaryDirectory() as folder:
-        paths = [Path(a) for a in arguments if a != "--large"]
-        if not paths:
-            paths = [make_cloud(Path(folder) / "cloud_384.vdb", 384, 0.44)]
-        if "--large" in arguments:
-            paths.append(Path(folder) / "ball_592.vdb")
-            command = [find_interpreter(), "-I", "-c", MAKE_BALL, str(paths[-1]), "592"]
+        paths = [Path(a) for a in arguments]
+        if arguments == ["--large"]:
+            paths = [Path(folder) / "ball_592.vdb"]
+            command = [find_interpreter(), "-I", "-c", MAKE_BALL, str(paths[0]), "592"]
             run(command, {"PATH": os.environ.get("PATH", "")})
+        elif not paths:
+            paths = [make_cloud(Path(folder) / "cloud_384.vdb", 384, 0.44)]
         for path in paths:
             row = results[path.name] = compare(path)
             ours, theirs = row["volcli"], row["openvdb"]
@@ -156,7 +156,7 @@ def main(arguments: list[str]) -> None:
                 f"{ours['cached_seconds']:.3f} s; peak memory "
                 f"{ours['peak_bytes'] / 1e6:.0f} MB for {ours['held_bytes'] / 1e6:.0f} MB of bricks"
             )
-    write_results("load", results)
+    write_results("load_large" if arguments == ["--large"] else "load", results)
 
 
 if __name__ == "__main__":

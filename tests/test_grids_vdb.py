@@ -17,9 +17,12 @@ from hypothesis import strategies as st
 from vdbwriter import ACTIVE_MASK, BLOSC, STORED, ZIP, Grid, write_vdb
 
 from volcli.errors import VolumeError
+from volcli.grids import vdb_tree
 from volcli.grids.pyopenvdb import find_interpreter, open_openvdb
+from volcli.grids.threads import in_threads
 from volcli.grids.tree import Tree
 from volcli.grids.vdb import open_vdb, unique_labels
+from volcli.grids.vdb_codec import BlockCodec
 
 VOLUMES = Path(__file__).parents[2] / "shared" / "volumes"
 CONFORMANCE = VOLUMES / "conformance"
@@ -435,6 +438,31 @@ def test_files_from_before_block_modes_read_back(tmp_path, version, zipped, valu
         volume = open_vdb(tmp_path / "a.vdb")
         for header, grid in zip(volume.headers, grids, strict=True):
             assert_holds(volume.read_tree(header), grid)
+
+
+@pytest.mark.parametrize("half", [False, True])
+@pytest.mark.parametrize("compression", [0, ZIP, BLOSC, ZIP | ACTIVE_MASK, BLOSC | ACTIVE_MASK])
+def test_parts_of_one_leaf_and_threads_read_what_one_part_does(
+    tmp_path, monkeypatch, compression, half
+):
+    path = tmp_path / "a.vdb"
+    grid = random_grid(np.random.default_rng(9), "float", compression=compression, half=half)
+    first = next(iter(grid.leaves))
+    grid.leaves[first] = (grid.leaves[first][0], np.ones((8, 8, 8), bool))  # full beside others
+    write_vdb(path, [grid])
+    volume = open_vdb(path)
+    whole = volume.read_tree(volume.headers[0])
+    assert_holds(whole, grid)
+    monkeypatch.setattr(vdb_tree, "_LEAVES_AT_ONCE", 1)
+    assert_same_trees(whole, volume.read_tree(volume.headers[0]))
+    monkeypatch.setattr(BlockCodec, "locate_leaves", lambda *_: None)
+    assert_same_trees(whole, volume.read_tree(volume.headers[0]))
+
+
+def test_work_in_threads_comes_back_in_order_and_its_first_error_is_raised():
+    assert list(in_threads(lambda n: n * n, range(100))) == [n * n for n in range(100)]
+    with pytest.raises(ZeroDivisionError):
+        list(in_threads(lambda n: 1 // (n - 50), range(100)))
 
 
 @pytest.mark.parametrize("version", [220, 221, 222, 223, 224])
