@@ -84,6 +84,11 @@ def test_each_picture_of_the_readme_is_there(picture):
     assert (ROOT / picture).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("picture", sorted((ROOT / "docs").rglob("*.png")), ids=lambda p: p.name)
+def test_no_picture_of_the_docs_carries_the_job_and_its_paths(picture):
+    assert b"volcli:job" not in picture.read_bytes()
+
+
 def test_each_make_target_of_the_readme_exists():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     named = set(re.findall(r"`?make (\w+)", README)) - {"a", "it"}
