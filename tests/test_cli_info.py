@@ -122,7 +122,8 @@ def test_values_that_are_no_numbers_are_counted_and_kept_out_of_the_range(tmp_pa
 @pytest.mark.parametrize("columns", [60, 100, 260])
 def test_tables_keep_to_the_width_of_the_terminal(monkeypatch, columns):
     monkeypatch.setenv("COLUMNS", str(columns))
-    ran = volcli("info", SAMPLES / "explosion.vdb", "--stats")
+    monkeypatch.chdir(SAMPLES)  # the path that the user gives is printed whole, however long
+    ran = volcli("info", "explosion.vdb", "--stats")
     assert max(map(len, ran.out.splitlines())) <= columns
     for text in ("149,911", "0.046", "UniformScaleTranslateMap", "3008", "min", "memory"):
         assert text in ran.out
@@ -131,7 +132,8 @@ def test_tables_keep_to_the_width_of_the_terminal(monkeypatch, columns):
 
 def test_without_a_terminal_100_columns_are_enough(monkeypatch):
     monkeypatch.delenv("COLUMNS", raising=False)
-    ran = volcli("info", SAMPLES / "cloud.vdb", "--stats")
+    monkeypatch.chdir(SAMPLES)
+    ran = volcli("info", "cloud.vdb", "--stats")
     if not os.isatty(1):
         assert max(map(len, ran.out.splitlines())) <= 100
 
