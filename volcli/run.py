@@ -81,6 +81,26 @@ class Loaded:
 
 
 @dataclass(frozen=True)
+class Rendered:
+    """A picture before it is written.
+
+    Attributes
+    ----------
+    job
+        The job with what was chosen for it filled in, so that it makes the same picture again.
+    result
+        The arrays; its times, with that of loading, are in ``seconds``.
+    warnings
+        What the user should know of the choices made and of the values read.
+    """
+
+    job: Job
+    result: RenderResult
+    seconds: dict[str, float]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Report:
     """What a job did.
 
@@ -122,7 +142,7 @@ def prepare(job: Job, *, overwrite: bool = True, writes: bool = True) -> Prepare
     UsageError, VolumeError, OutputError
         Whatever is wrong first.
     """
-    files = _outputs(job)
+    files = outputs(job)
     if writes and not files:
         raise UsageError("nothing to write: give -o OUT.exr (or output.image in the job)")
     for path in files.values():
@@ -195,6 +215,18 @@ def run(
         A result cannot be written; a pixel is NaN or Inf; the camera the job asks for has no
         frame.
     """
+    rendered = render_loaded(prepared, loaded, threads=threads, on_stage=on_stage)
+    return write(prepared, rendered, overwrite=overwrite, on_stage=on_stage)
+
+
+def render_loaded(
+    prepared: Prepared,
+    loaded: Loaded,
+    *,
+    threads: int | None = None,
+    on_stage: OnStage = lambda stage, done, total: None,
+) -> Rendered:
+    """The first half of `run`: the arrays of a picture."""
     plan, density = prepared.plan, loaded.density
     box = UNKNOWN_BOX if density.is_empty else density.world_box()
     job = _resolved(prepared.job, make_camera(prepared.job.camera, box))
@@ -214,16 +246,29 @@ def run(
         "compile": result.compile_seconds,
         "render": result.render_seconds,
     }
+    return Rendered(job, result, seconds, (*plan.warnings, *loaded.warnings))
+
+
+def write(
+    prepared: Prepared,
+    rendered: Rendered,
+    *,
+    overwrite: bool = True,
+    on_stage: OnStage = lambda stage, done, total: None,
+) -> Report:
+    """The second half of `run`: arrays to files."""
+    job, result, seconds = rendered.job, rendered.result, dict(rendered.seconds)
     writing = time.perf_counter()
     maps, notes = _write(prepared, result, job, seconds, overwrite, on_stage)
     seconds["write"] = time.perf_counter() - writing
     picture = prepared.files.get("picture")
+    width, height = job.camera.resolution
     return Report(
         image=None if picture is None else str(picture),
         maps=maps,
-        size=camera.resolution,
-        rule=plan.rule,
-        rays=camera.resolution[0] * camera.resolution[1],
+        size=(width, height),
+        rule=prepared.plan.rule,
+        rays=width * height,
         cells=result.evaluations,
         seconds={name: round(value, 4) for name, value in seconds.items()},
         transmittance={
@@ -233,7 +278,7 @@ def run(
         },
         camera=job.camera.model_dump(mode="json", exclude_none=True),
         peak_memory_bytes=peak_memory_bytes(),
-        warnings=[*plan.warnings, *loaded.warnings, *notes],
+        warnings=[*rendered.warnings, *notes],
     )
 
 
@@ -254,7 +299,7 @@ def peak_memory_bytes() -> int:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
-def _outputs(job: Job) -> dict[str, Path]:
+def outputs(job: Job) -> dict[str, Path]:
     """What the job writes: the picture and, beside it, ``<stem>.<map>.<ext>``; may be nothing."""
     picture = job.output.image
     if picture is None:
