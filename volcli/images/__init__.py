@@ -10,6 +10,7 @@ paths.py        where an image may be written
 write.py        colour, channels and maps to EXR and PNG
 store.py        pixels to a file, whole or not at all
 read.py         an EXR's channels and header; the stored pixels of any image
+channels.py     the channels of any image, one plane each, for looking at
 background.py   any image as premultiplied, scene-linear colour
 color.py        the sRGB curve; other colour spaces to linear
 pixels.py       arrays alone: rounding, scaling, counting what cannot be shown
@@ -17,15 +18,18 @@ library.py      OpenImageIO's way of opening and of failing
 """
 
 from volcli.images.background import read_background
+from volcli.images.channels import Channels, read_channels
 from volcli.images.color import linear_from_srgb, srgb_from_linear
 from volcli.images.paths import check_output
 from volcli.images.read import read_exr
 from volcli.images.write import write_exr, write_map, write_png
 
 __all__ = [
+    "Channels",
     "check_output",
     "linear_from_srgb",
     "read_background",
+    "read_channels",
     "read_exr",
     "srgb_from_linear",
     "write_exr",

@@ -53,12 +53,8 @@ def read_stored(path: Path) -> tuple[NDArray[np.float32], "oiio.ImageSpec", str]
     """(h, w, c) float32 pixels as stored, their spec, and the format's name."""
     import OpenImageIO as oiio
 
+    check_is_file(path)
     try:
-        mode = mode_of(path)
-        if mode is None:
-            raise UsageError(f"{path}: no such file; check the path")
-        if stat.S_ISDIR(mode):
-            raise UsageError(f"{path}: is a folder; name an image")
         source = open_image(path)
     except (OSError, ValueError, Failed) as error:
         raise UsageError(f"{path}: not a readable image ({reason_of(error)})") from error
@@ -73,3 +69,21 @@ def read_stored(path: Path) -> tuple[NDArray[np.float32], "oiio.ImageSpec", str]
         return pixels.reshape(spec.height, spec.width, spec.nchannels), spec, source.format_name()
     finally:
         source.close()
+
+
+def check_is_file(path: Path) -> None:
+    """Refuse a path that leads to nothing, or to a folder, before it is opened as an image.
+
+    Raises
+    ------
+    UsageError
+        Saying which.
+    """
+    try:
+        mode = mode_of(path)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{path}: not a readable image ({reason_of(error)})") from error
+    if mode is None:
+        raise UsageError(f"{path}: no such file; check the path")
+    if stat.S_ISDIR(mode):
+        raise UsageError(f"{path}: is a folder; name an image")
