@@ -13,9 +13,10 @@ PACKAGE = Path(__file__).parents[1] / "volcli"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 LAYERS = [
-    {"errors"},
-    {"schema", "grids", "quadrature"},
-    {"plan", "camera", "kernels"},
+    {"errors", "fields", "srgb", "blackbody"},
+    {"sources", "grids", "quadrature"},
+    {"schema"},
+    {"plan", "camera", "kernels", "tables"},
     {"render"},
     {"config", "images"},
     {"run", "describe"},

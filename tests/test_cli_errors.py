@@ -90,7 +90,12 @@ WRONG = {
     "step NaN": ("ball.npz -o a.exr --step nan", 2, "^--step nan: must be finite$"),
     "step infinite": ("ball.npz -o a.exr --step inf", 2, "^--step inf: must be finite$"),
     "step a word": ("ball.npz -o a.exr --step x", 2, "^--step: must be a valid number"),
-    "scale 0": ("ball.npz -o a.exr --density-scale 0", 2, "--density-scale 0: must be above 0"),
+    "scale 0": ("ball.npz -o a.exr --density-scale 0", 2, "density.scale is 0 and nothing is"),
+    "scale below 0": (
+        "ball.npz -o a.exr --density-scale -1",
+        2,
+        "^--density-scale -1: must be at least 0$",
+    ),
     "scale NaN": (
         "ball.npz -o a.exr --density-scale nan",
         2,

@@ -5,7 +5,9 @@ Flags win over the file, the file over defaults.
 
 from __future__ import annotations
 
+import copy
 import difflib
+import itertools
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,22 +16,35 @@ from typing import Any
 from pydantic import ValidationError
 
 from volcli.errors import UsageError
-from volcli.schema import Job, field
+from volcli.schema import Job, field, keys, table_of
+from volcli.sources import SOURCES
 
-_FILES = ("density.file", "background.image", "output.image")
+_FILES = ("density.file", "color.file", "emission.file", "background.image", "output.image")
 """Fields that are paths: in a job file they are relative to the folder of that file."""
 
 _ANY = object()
 
+_EMITTED = ("grid", "ramp", "blackbody")
+
 _ENDS: list[tuple[str, Any, str]] = [
-    ("color.constant", _ANY, "color.grid"),
-    ("color.grid", _ANY, "color.constant"),
+    *((f"color.{a}", _ANY, f"color.{b}") for a in SOURCES for b in SOURCES if a != b),
+    *((f"emission.{a}", _ANY, f"emission.{b}") for a in _EMITTED for b in _EMITTED if a != b),
+    ("emission.ramp", _ANY, "emission.constant"),
+    ("emission.blackbody", _ANY, "emission.constant"),
+    *(
+        (f"{part}.ramp.{a}", _ANY, f"{part}.ramp.{b}")
+        for part in ("color", "emission")
+        for a, b in (("map", "stops"), ("stops", "map"), ("range", "stops"), ("stops", "range"))
+    ),
     ("background.color", _ANY, "background.image"),
     ("background.image", _ANY, "background.color"),
     ("camera.type", "perspective", "camera.width"),
     ("quadrature.rule", "exact", "quadrature.step"),
 ]
-"""(key, value, other key): the first, set on the command line, drops the other that a file set."""
+"""(key, value, other key): the first, set on the command line, drops the other that a file set.
+
+A key inside a table stands for the table too: ``color.ramp.map`` drops ``color.grid``.
+"""
 
 
 def load_job(
@@ -102,11 +117,11 @@ def parse_setting(text: str) -> tuple[str, Any]:
     Raises
     ------
     UsageError
-        If there is no '=', or the key is not PART.FIELD.
+        If there is no '=', or the key is not PART.FIELD or PART.TABLE.FIELD.
     """
     key, equals, value = text.partition("=")
     key = key.strip()
-    if not equals or key.count(".") != 1:
+    if not equals or key.count(".") not in (1, 2):
         raise UsageError(f"--set {text}: write PART.FIELD=VALUE, such as density.scale=2")
     if not value.strip():
         return key, None
@@ -141,19 +156,15 @@ def make_job(
     UsageError
         One line for the first thing that is wrong: what, where, what to do.
     """
-    merged: dict[str, Any] = {
-        part: dict(table) if isinstance(table, Mapping) else table for part, table in tables.items()
-    }
+    merged: dict[str, Any] = copy.deepcopy(dict(tables))
     given = {key for key, _ in settings}
     for key, value in settings:
-        part, name = key.split(".")
-        table = merged.setdefault(part, {})
-        if not isinstance(table, dict):
-            raise UsageError(f"{source}: {part}: must be a table, [{part}]")
         for winner, wanted, loser in _ENDS:
-            if key == winner and wanted in (_ANY, value) and loser not in given:
-                table.pop(loser.split(".")[1], None)
-        if value is None and key in _known_keys():
+            wins = key == winner or key.startswith(f"{winner}.")
+            if wins and wanted in (_ANY, value) and not _given(loser, given):
+                _table(merged, loser, source).pop(loser.split(".")[-1], None)
+        table, name = _table(merged, key, source), key.split(".")[-1]
+        if value is None and key in keys():
             table.pop(name, None)
         else:
             table[name] = value
@@ -161,6 +172,22 @@ def make_job(
         return Job.model_validate(merged)
     except ValidationError as error:
         raise UsageError(_explained(error, source, spelled or {})) from error
+
+
+def _given(key: str, given: set[str]) -> bool:
+    """Whether a key, or one inside it, is among those that were given."""
+    return any(other == key or other.startswith(f"{key}.") for other in given)
+
+
+def _table(tables: dict[str, Any], key: str, source: str) -> dict[str, Any]:
+    """The table that a key lies in, made where there is none."""
+    path = key.split(".")[:-1]
+    for depth, part in enumerate(path, 1):
+        tables = tables.setdefault(part, {})
+        if not isinstance(tables, dict):
+            where = ".".join(path[:depth])
+            raise UsageError(f"{source}: {where}: must be a table, [{where}]")
+    return tables
 
 
 def job_as_toml(job: Job) -> str:
@@ -180,6 +207,13 @@ _KINDS = {
     "bool": "true or false",
 }
 
+_LISTS = {
+    "density.ramp.stops": "a list of [value, density] pairs",
+    "stops": "a list of [value, R, G, B] rows of numbers",
+    "range": "a list of 2 numbers, [low, high]",
+}
+"""What a list must hold, by its key or the last part of it, where it is not three numbers."""
+
 _LIMITS = {
     "greater_than": ("above", "gt"),
     "greater_than_equal": ("at least", "ge"),
@@ -191,23 +225,35 @@ _LIMITS = {
 def _explained(error: ValidationError, source: str, spelled: Mapping[str, str]) -> str:
     """The first problem of a job in one line: where, what, and what it must be."""
     problem = error.errors()[0]
-    key = ".".join([part for part in problem["loc"] if isinstance(part, str)][:2])
-    where = spelled.get(key, f"{source}: {key}")
+    named = itertools.takewhile(lambda part: isinstance(part, str), problem["loc"])
+    key = ".".join(str(part) for part in named)
+    where = _spelled(key, spelled) or f"{source}: {key}"
     if problem["type"] == "value_error":
         message = problem["msg"].removeprefix("Value error, ")
         return f"{where}: {message}" if "." in key else f"{source}: {message}"
     if problem["type"] == "extra_forbidden":
-        return f"{spelled.get(key, source)}: unknown key '{key}'{_suggested(key)}"
+        return f"{_spelled(key, spelled) or source}: unknown key '{key}'{_suggested(key)}"
     value = problem["input"]
+    if problem["type"] == "missing" and isinstance(problem["loc"][-1], str):
+        return f"{where}: is missing; give {_wanted(key, problem)}"
     if key not in spelled and not isinstance(value, Mapping) and problem["type"] != "missing":
         return f"{where}: must be {_wanted(key, problem)}, not {value!r}"
     return f"{where}: must be {_wanted(key, problem)}"
 
 
+def _spelled(key: str, spelled: Mapping[str, str]) -> str | None:
+    """How the user wrote a setting of a key, or of the table that it lies in."""
+    while key:
+        if key in spelled:
+            return spelled[key]
+        key = key.rpartition(".")[0]
+    return None
+
+
 def _wanted(key: str, problem: Any) -> str:
     """What a value must be, from pydantic's type of problem and the field."""
     kind, context = problem["type"], problem.get("ctx", {})
-    if "." not in key:
+    if _is_table(key):
         return f"a table, [{key}]"
     if kind in _LIMITS:
         word, limit = _LIMITS[kind]
@@ -216,34 +262,42 @@ def _wanted(key: str, problem: Any) -> str:
         return "finite"
     if kind == "literal_error":
         return str(context["expected"])
-    _, default = field(key)
     if kind.startswith("tuple") or kind in ("missing", "too_long", "too_short"):
-        if default == ():
-            return 'a list of names in quotes, such as ["depth"]'
-        count = 3 if default is None else len(default)
-        return f"a list of {count} numbers"
+        return _LISTS.get(key) or _LISTS.get(key.rpartition(".")[2]) or _sized(key)
     if kind.endswith("path_type"):
         return _KINDS["path"]
     return _KINDS.get(kind.split("_")[0], problem["msg"].removeprefix("Input should be "))
 
 
+def _sized(key: str) -> str:
+    """What a list must hold, from the default of its field; a field without one is a name."""
+    _, default = field(key)
+    if key.endswith(".grid"):
+        return "the name of a grid in quotes"
+    if default == ():
+        return 'a list of names in quotes, such as ["depth"]'
+    count = 3 if default is None else len(default)
+    return f"a list of {count} numbers"
+
+
+def _is_table(key: str) -> bool:
+    model: Any = Job
+    for part in key.split("."):
+        model = table_of(model, part)
+        if model is None:
+            return False
+    return True
+
+
 def _suggested(key: str) -> str:
     """What may have been meant by a key that there is not."""
-    known = _known_keys()
-    part, dot, name = key.partition(".")
-    if not dot:
-        close = difflib.get_close_matches(part, [k for k in known if "." not in k], n=1)
-        other = ", ".join(k for k in known if "." not in k)
-        return f"; did you mean '{close[0]}'?" if close else f"; a job has: {other}"
-    names = [k.partition(".")[2] for k in known if k.startswith(f"{part}.")]
-    close = [f"{part}.{n}" for n in difflib.get_close_matches(name, names, n=1)]
-    close += [k for k in known if k.endswith(f".{name}")]
-    return f"; did you mean '{close[0]}'?" if close else f"; [{part}] has: {', '.join(names)}"
-
-
-def _known_keys() -> list[str]:
-    keys = list(Job.model_fields)
-    for part, info in Job.model_fields.items():
-        model: Any = info.annotation
-        keys += [f"{part}.{name}" for name in model.model_fields]
-    return keys
+    known = keys()
+    table, _, name = key.rpartition(".")
+    inside = [k for k in known if k.rpartition(".")[0] == table]
+    names = [k.rpartition(".")[2] for k in inside]
+    close = [f"{table}.{n}".strip(".") for n in difflib.get_close_matches(name, names, n=1)]
+    if table:
+        close += [k for k in known if k.endswith(f".{name}")]
+    if close:
+        return f"; did you mean '{close[0]}'?"
+    return f"; {f'[{table}]' if table else 'a job'} has: {', '.join(names)}"
