@@ -26,10 +26,10 @@ def pixels_of(camera, points):
     """Where points are in the picture, from -1 to 1 across each of its sides, and how far off."""
     away = np.asarray(points) - camera.eye
     along = away @ camera.forward
-    scale = along if camera.perspective else 1.0
-    width, height = camera.resolution
-    y = away @ camera.upward / scale / camera.half_height
-    x = away @ camera.right / scale / camera.half_height * height / width
+    scale = along if camera.type == "perspective" else 1.0
+    half_width, half_height = np.multiply(camera.resolution, camera.pixel) / 2
+    y = away @ camera.upward / scale / half_height
+    x = away @ camera.right / scale / half_width
     return x, y, along
 
 
@@ -78,11 +78,11 @@ def test_directions_have_length_1_and_the_frame_is_right_handed(eye, target, up,
     np.testing.assert_allclose(directions[4], forward / np.linalg.norm(forward), atol=1e-12)
 
 
-def test_axial_is_the_cosine_to_the_cameras_axis():
+def test_depth_is_distance_times_the_cosine_to_the_cameras_axis():
     camera = View((0.0, 0.0, 5.0), (0.0, 0.0, 0.0), fov=90.0, resolution=(1, 3)).camera
     _, directions = camera.rays(ALL, ALL)
     edge = 1 / np.sqrt(1 + (2 / 3) ** 2)
-    np.testing.assert_allclose(camera.axial(directions), [edge, 1.0, edge], rtol=1e-14)
+    np.testing.assert_allclose(camera.depth_per_distance(directions), [edge, 1.0, edge], rtol=1e-14)
 
 
 def test_the_length_of_up_does_not_matter():
@@ -131,7 +131,7 @@ def test_a_target_alone_is_looked_at_from_where_all_of_the_box_is_seen():
 
 def test_the_width_of_an_orthographic_picture_is_kept():
     camera = make_camera(Camera(type="orthographic", width=12.0, resolution=(60, 20)), BOX)
-    assert camera.half_height == pytest.approx(2.0)
+    assert camera.pixel == pytest.approx((0.2, 0.2))
 
 
 @pytest.mark.parametrize("kind", ["perspective", "orthographic"])

@@ -6,6 +6,7 @@ its own part of the image. Nothing here reads or writes files.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable
@@ -60,8 +61,14 @@ class RenderResult:
     optical_depth, transmittance, opacity
         (h, w) float32: tau, exp(-tau) and 1 - exp(-tau), each rounded once from float64.
     depth
-        (h, w) float32: the expected hit distance along the camera's axis, world units, +inf where
-        nothing can be hit; None when the plan leaves it out.
+        (h, w) float32: the expected hit distance along the camera's axis (of a panorama: along the
+        ray), world units, +inf where nothing can be hit; None when the plan leaves it out.
+
+    Of a pixel with several samples each is the mean over them. For optical depth that is what lies
+    behind the pixel on average (mass over area), no longer -log of the mean transmittance, which
+    the other layer gives. Depth is weighted with each sample's opacity, the probability that it
+    hits.
+
     evaluations
         Cells, or samples of the midpoint rule.
     compile_seconds, render_seconds
@@ -131,25 +138,28 @@ def render(
         on_compiled()
 
     def one_tile(corner: tuple[int, int]) -> int:
-        rows = slice(corner[0], min(corner[0] + TILE, height))
-        columns = slice(corner[1], min(corner[1] + TILE, width))
-        origins, directions = camera.rays(rows, columns)
-        tile_tau, tile_light, tile_distance, evaluations = integrate(origins, directions)
-        tile_opacity = -np.expm1(-tile_tau)
+        rows = slice(corner[0], min(corner[0] + edge, height))
+        columns = slice(corner[1], min(corner[1] + edge, width))
+        shape = (samples, *tau[rows, columns].shape)
+        origins, directions = camera.rays(rows, columns, camera.samples)
+        ray_tau, ray_light, ray_distance, evaluations = integrate(origins, directions)
+        ray_opacity = -np.expm1(-ray_tau)
         if constant is not None:
-            tile_light = tile_opacity[:, None] * constant
-        shape = tau[rows, columns].shape
+            ray_light = ray_opacity[:, None] * constant
         with np.errstate(over="ignore"):  # beyond float32 it is Inf, and reported as such
-            tau[rows, columns] = tile_tau.reshape(shape)
-        transmittance[rows, columns] = np.exp(-tile_tau).reshape(shape)
-        opacity[rows, columns] = tile_opacity.reshape(shape)
-        light[rows, columns] = tile_light.reshape(*shape, 3)
+            tau[rows, columns] = _mean(ray_tau.reshape(shape))
+        transmittance[rows, columns] = _mean(np.exp(-ray_tau).reshape(shape))
+        opacity[rows, columns] = _mean(ray_opacity.reshape(shape))
+        light[rows, columns] = _mean(ray_light.reshape(*shape, 3))
         if depth is not None:
-            depth[rows, columns] = (tile_distance * camera.axial(directions)).reshape(shape)
+            ray_depth = ray_distance * camera.depth_per_distance(directions)
+            depth[rows, columns] = _mean_depth(ray_depth.reshape(shape), ray_opacity.reshape(shape))
         return evaluations
 
     evaluations = 0
-    tiles = [(y, x) for y in range(0, height, TILE) for x in range(0, width, TILE)]
+    samples = len(camera.samples)
+    edge = max(1, TILE // (math.isqrt(samples - 1) + 1))  # of about as many rays for any samples
+    tiles = [(y, x) for y in range(0, height, edge) for x in range(0, width, edge)]
     if not scene.density.is_empty:
         pool = ThreadPoolExecutor(threads or available_threads())
         try:
@@ -171,6 +181,28 @@ def render(
     )
     _check_finite(result)
     return result
+
+
+def _sum(values: NDArray[Any]) -> NDArray[Any]:
+    """The sum over the first axis, from the first to the last whatever the shape of the tile.
+
+    np.sum chooses its order by the shape, and with it the last bit.
+    """
+    total: NDArray[Any] = np.cumsum(values, axis=0)[-1]
+    return total
+
+
+def _mean(values: NDArray[Any]) -> NDArray[Any]:
+    return _sum(values) / len(values)
+
+
+def _mean_depth(depth: NDArray[Any], opacity: NDArray[Any]) -> NDArray[Any]:
+    """The mean over the first axis, weighted with the probability of a hit; +inf where it is 0."""
+    hit = opacity > 0
+    total = _sum(opacity)
+    weight = opacity / np.where(total > 0, total, 1.0)
+    mean = _sum(np.multiply(weight, depth, out=np.zeros_like(depth), where=hit))
+    return np.where(hit.any(axis=0), mean, np.inf)
 
 
 def over(result: RenderResult, background: Floats | None) -> Floats:

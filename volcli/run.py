@@ -32,7 +32,7 @@ from volcli.grids import (
 )
 from volcli.plan import Plan, make_plan
 from volcli.render import RenderResult, Scene, over, render
-from volcli.schema import Job
+from volcli.schema import DEFAULT_FOV, Job
 
 UNKNOWN_BOX = np.array([[-1.0] * 3, [1.0] * 3])
 """(2, 3) world units: what is framed where there is no volume to frame."""
@@ -160,7 +160,7 @@ def prepare(job: Job, *, overwrite: bool = True, writes: bool = True) -> Prepare
     if job.background.color is not None:
         background = np.array([*job.background.color, 1.0], np.float32)
     elif job.background.image is not None:
-        background = images.read_background(job.background.image, job.camera.resolution)
+        background = images.read_background(job.background.image, job.camera.size)
     return Prepared(job, volume, plan, files, background)
 
 
@@ -262,13 +262,13 @@ def write(
     maps, notes = _write(prepared, result, job, seconds, overwrite, on_stage)
     seconds["write"] = time.perf_counter() - writing
     picture = prepared.files.get("picture")
-    width, height = job.camera.resolution
+    width, height = job.camera.size
     return Report(
         image=None if picture is None else str(picture),
         maps=maps,
         size=(width, height),
         rule=prepared.plan.rule,
-        rays=width * height,
+        rays=width * height * job.camera.samples,
         cells=result.evaluations,
         seconds={name: round(value, 4) for name, value in seconds.items()},
         transmittance={
@@ -315,10 +315,12 @@ def _resolved(job: Job, camera: Camera) -> Job:
     chosen: dict[str, Any] = {
         "eye": tuple(camera.eye.tolist()),
         "target": tuple(camera.target.tolist()),
+        "resolution": camera.resolution,
     }
-    if not camera.perspective and job.camera.width is None:
-        width, height = camera.resolution
-        chosen["width"] = 2 * camera.half_height * width / height
+    if camera.type == "orthographic" and job.camera.width is None:
+        chosen["width"] = camera.pixel[0] * camera.resolution[0]
+    if camera.type == "perspective" and job.camera.focal is None and job.camera.fov is None:
+        chosen["fov"] = DEFAULT_FOV
     parts: dict[str, Any] = {"camera": job.camera.model_copy(update=chosen)}
     for part, name in (("density", "file"), ("background", "image"), ("output", "image")):
         table = getattr(job, part)
