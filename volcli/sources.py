@@ -121,7 +121,7 @@ class Color(Part):
 
 
 class Emission(Part):
-    """Light that is emitted whatever the density, dL = T e ds: one of a grid, a ramp or a blackbody.
+    """Light emitted whatever the density, dL = T e ds: one of a grid, a ramp or a blackbody.
 
     e is radiance per world unit, and 0 outside the voxels of its grid.
     """

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from volcli.errors import NonFiniteError
-from volcli.images.color import SRGB, srgb_from_linear
+from volcli.images.color import SRGB
 from volcli.images.paths import checked_path
 from volcli.images.pixels import any_channel, as_float32, counted, quantised, scaled
 from volcli.images.store import Attribute, header_of, write_whole
+from volcli.srgb import srgb_from_linear
 
 UNIT_MAPS = ("transmittance", "opacity")
 """Maps whose values lie in [0, 1]; a PNG holds them as they are, every other map scaled."""
