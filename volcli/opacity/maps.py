@@ -1,0 +1,172 @@
+"""An image to maps: what its channels, layers or header say of the opacity of a volume.
+
+An EXR of volcli holds optical depth and transmittance as layers, which no background touches; any
+other image has at most alpha, of which the rest follows. What is derived is said in ``source``.
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from volcli.errors import UsageError
+from volcli.images import Channels, read_channels
+
+Floats = NDArray[np.float32]
+
+MAP_HEADER = "volcli:map"
+"""The header entry that names the map in a file that holds nothing else."""
+
+
+@dataclass(frozen=True)
+class Maps:
+    """The maps of one image.
+
+    Attributes
+    ----------
+    stored
+        The image as it is stored.
+    opacity, transmittance, optical_depth
+        (h, w) float32. Optical depth is +Inf where opacity is 1 and nothing tells more.
+    depth
+        (h, w) float32, or None: distance along the camera's axis, +Inf where nothing is hit.
+    source
+        Map -> where its values come from, for people: ``layer transmittance.Y``.
+    """
+
+    stored: Channels
+    opacity: Floats
+    transmittance: Floats
+    optical_depth: Floats
+    depth: Floats | None
+    source: dict[str, str]
+
+    @property
+    def layers(self) -> dict[str, Floats]:
+        """The maps that there are, by name."""
+        maps = {
+            "opacity": self.opacity,
+            "transmittance": self.transmittance,
+            "optical_depth": self.optical_depth,
+        }
+        return maps if self.depth is None else maps | {"depth": self.depth}
+
+    @cached_property
+    def job(self) -> dict[str, Any]:
+        """The tables of the job that the header holds; empty where it holds none."""
+        text = self.stored.attributes.get("volcli:job")
+        try:
+            return tomllib.loads(str(text)) if text else {}
+        except tomllib.TOMLDecodeError:
+            return {}
+
+    @property
+    def rule(self) -> str | None:
+        """The rule of integration by which volcli made the image, if it says so."""
+        rule = self.stored.attributes.get("volcli:rule")
+        return None if rule is None else str(rule)
+
+    @property
+    def density_scale(self) -> float | None:
+        """The density scale that the image was rendered with, if it says so."""
+        scale = self.job.get("density", {}).get("scale")
+        return float(scale) if isinstance(scale, int | float) else None
+
+
+def read_maps(path: str | os.PathLike[str]) -> Maps:
+    """The maps of an EXR of volcli, of a map that volcli wrote, or of any image with alpha.
+
+    Raises
+    ------
+    UsageError
+        The file cannot be read, or has neither alpha nor a map that tells of opacity.
+    """
+    stored = read_channels(path)
+    if MAP_HEADER in stored.attributes:
+        return _of_one_map(stored, str(stored.attributes[MAP_HEADER]))
+    alpha = stored.find("A", "alpha", *(n for n in stored.planes if n.lower().endswith(".a")))
+    tau = stored.find("optical_depth.Y")
+    transmittance = stored.find("transmittance.Y")
+    source: dict[str, str] = {}
+    if tau is not None:
+        opacity, source["opacity"] = _opacity_of(tau), "1 - exp(-optical_depth.Y)"
+    elif transmittance is not None:
+        opacity, source["opacity"] = 1 - transmittance, "1 - transmittance.Y"
+    elif alpha is not None:
+        opacity, source["opacity"] = alpha, "alpha"
+    elif stored.file_format == "png" and stored.find("R") is not None:
+        # volcli leaves alpha out of a PNG whose every pixel is opaque.
+        opacity = np.ones(stored.size[::-1], np.float32)
+        source["opacity"] = "no alpha: opaque"
+    else:
+        raise UsageError(
+            f"{stored.path}: no alpha, and no layer of volcli's; it has: "
+            f"{', '.join(stored.planes)}; render an .exr, or an image with alpha"
+        )
+    return _completed(stored, opacity, transmittance, tau, stored.find("Z"), source)
+
+
+def _completed(
+    stored: Channels,
+    opacity: Floats,
+    transmittance: Floats | None,
+    tau: Floats | None,
+    depth: Floats | None,
+    source: dict[str, str],
+) -> Maps:
+    """Fill in what follows from opacity."""
+    if transmittance is None:
+        transmittance, source["transmittance"] = 1 - opacity, "1 - opacity"
+    else:
+        source["transmittance"] = "layer transmittance.Y"
+    if tau is None:
+        tau, source["optical_depth"] = _depth_of(opacity), "-log(1 - opacity)"
+    else:
+        source["optical_depth"] = "layer optical_depth.Y"
+    if depth is not None:
+        source["depth"] = "channel Z"
+    return Maps(stored, opacity, transmittance, tau, depth, source)
+
+
+def _of_one_map(stored: Channels, name: str) -> Maps:
+    """The maps that one map of volcli's tells; a PNG's values are scaled back."""
+    low = float(stored.attributes.get("volcli:map_lo", 0.0))
+    high = float(stored.attributes.get("volcli:map_hi", 1.0))
+    (values,) = stored.planes.values()
+    if (low, high) != (0.0, 1.0):
+        values = (low + values * np.float64(high - low)).astype(np.float32)
+    if name == "opacity":
+        maps = _completed(stored, values, None, None, None, {"opacity": "the map"})
+    elif name == "transmittance":
+        maps = _completed(stored, 1 - values, values, None, None, {"opacity": "1 - the map"})
+        maps.source["transmittance"] = "the map"
+    elif name == "optical_depth":
+        opacity = _opacity_of(values)
+        maps = _completed(stored, opacity, None, values, None, {"opacity": "1 - exp(-the map)"})
+        maps.source["optical_depth"] = "the map"
+    else:
+        raise UsageError(
+            f"{stored.path}: is a map of {name}, which does not tell the opacity; inspect the "
+            f"picture, or a map of opacity, transmittance or optical_depth"
+        )
+    return maps
+
+
+def _opacity_of(tau: Floats) -> Floats:
+    """1 - exp(-tau), as -expm1(-tau): 1 - exp loses all digits where tau is small."""
+    opacity = np.negative(tau)
+    with np.errstate(over="ignore", invalid="ignore"):
+        np.expm1(opacity, out=opacity)
+    return np.negative(opacity, out=opacity)
+
+
+def _depth_of(opacity: Floats) -> Floats:
+    """-log(1 - opacity), +Inf where opacity is 1 or more, NaN where it is NaN."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return -np.log1p(-np.minimum(opacity, 1))
