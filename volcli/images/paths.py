@@ -11,25 +11,37 @@ from volcli.errors import OutputError, UsageError
 from volcli.images.library import reason_of
 
 
-def check_output(path: str | os.PathLike[str], *, overwrite: bool = True) -> None:
-    """Refuse, before anything is computed, a path that an image cannot be written to.
+IMAGES = (".exr", ".png")
+"""The extensions of images that volcli writes."""
+
+
+def check_output(
+    path: str | os.PathLike[str], *, overwrite: bool = True, kinds: tuple[str, ...] = IMAGES
+) -> None:
+    """Refuse, before anything is computed, a path that a file cannot be written to.
 
     What only writing can show (a full disk, a quota) is left to the writers, which report it as
     the same `OutputError`.
 
+    Parameters
+    ----------
+    kinds
+        The extensions that there may be; by default those of images.
+
     Raises
     ------
     UsageError
-        The extension is neither ``.exr`` nor ``.png``.
+        The extension is another.
     OutputError
         The folder is missing, is no folder or is read-only; the path is a folder or a special
         file; or it exists and ``overwrite`` is False.
     """
     path = Path(path)
     if os.path.isdir(path):  # noqa: PTH112 - Path.is_dir raises where a name is too long
-        raise OutputError(f"{path}: is a folder; name a file inside it, such as picture.exr")
-    if path.suffix.lower() not in (".exr", ".png"):
-        raise UsageError(f"{path}: unknown image format '{path.suffix}'; use .exr or .png")
+        raise OutputError(f"{path}: is a folder; name a file inside it, such as picture{kinds[0]}")
+    if path.suffix.lower() not in kinds:
+        what = "image format" if kinds == IMAGES else "extension"
+        raise UsageError(f"{path}: unknown {what} '{path.suffix}'; use {' or '.join(kinds)}")
     folder = path.parent
     try:
         folder_mode = mode_of(folder)
