@@ -19,6 +19,9 @@ from volcli.errors import UsageError
 
 Floats = NDArray[np.float64]
 
+Frame = tuple[Floats, Floats, Floats]
+"""Unit vectors to the right, upward and forward."""
+
 FRAMING_MARGIN = 1.05
 """How much larger than the volume's box the automatic frame is."""
 
@@ -178,7 +181,7 @@ def make_camera(job: schema.Camera, box: Floats) -> Camera:
     width, height = job.size
     pixel = (0.0, 0.0)
     if job.type != "panorama":
-        half_height, distance = _framed(job, box, target, (right, upward, forward))
+        half_height, distance = frame_box(job, box, target, (right, upward, forward))
         pixel = (2.0 * half_height / height,) * 2
     if job.focal is not None:
         pixel = (1.0 / job.focal[0], 1.0 / job.focal[1])
@@ -205,7 +208,7 @@ def _ahead(up: Floats) -> Floats:
     return np.array([-1.0, 0.0, 0.0]) if along_z else np.array([0.0, 0.0, -1.0])
 
 
-def _frame(forward: Floats, up: Floats) -> tuple[Floats, Floats, Floats]:
+def _frame(forward: Floats, up: Floats) -> Frame:
     """Unit vectors to the right, upward and forward."""
     forward = forward / np.abs(forward).max()
     forward /= np.linalg.norm(forward)
@@ -220,9 +223,7 @@ def _frame(forward: Floats, up: Floats) -> tuple[Floats, Floats, Floats]:
     return right, np.cross(right, forward), forward
 
 
-def _framed(
-    job: schema.Camera, box: Floats, target: Floats, frame: tuple[Floats, Floats, Floats]
-) -> tuple[float, float]:
+def frame_box(job: schema.Camera, box: Floats, target: Floats, frame: Frame) -> tuple[float, float]:
     """(half the picture's height, distance of an eye that sees the whole box).
 
     The height is that at distance 1 of a perspective camera, world units of an orthographic one.
