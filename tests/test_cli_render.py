@@ -351,7 +351,7 @@ def test_results_and_notes_keep_their_order_when_they_share_a_stream(folder):
 def test_help_names_every_option_with_its_default():
     ran = volcli("render", "--help")
     assert ran.code == 0
-    for text in ("[default: 1]", "[default: 0,1,0]", "[default: 800x600]", "--set KEY=VALUE"):
+    for text in ("[default: 1]", "[default: 0,1,0]", "Absent: 800x600", "--set KEY=VALUE"):
         assert text in " ".join(ran.out.split())
 
 

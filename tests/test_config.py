@@ -66,13 +66,18 @@ FIELDS = {
     "emission.blackbody": blackbodies,
     "emission.strength": light,
     "emission.file": paths,
-    "camera.type": st.sampled_from(["perspective", "orthographic"]),
+    "camera.type": st.sampled_from(["perspective", "orthographic", "panorama"]),
     "camera.eye": vectors,
     "camera.target": vectors,
     "camera.up": vectors.filter(any),
     "camera.fov": st.floats(0, 180, exclude_min=True, exclude_max=True),
     "camera.width": positive,
+    "camera.focal": st.lists(positive, min_size=2, max_size=2),
+    "camera.principal": st.lists(finite, min_size=2, max_size=2),
+    "camera.transforms": paths,
+    "camera.frame": st.one_of(st.integers(0, 10**9), st.just("all")),
     "camera.resolution": st.lists(pixels, min_size=2, max_size=2),
+    "camera.samples": st.integers(1, 4096),
     "quadrature.rule": st.sampled_from(["exact", "midpoint"]),
     "quadrature.step": positive,
     "background.color": colours,
@@ -82,8 +87,12 @@ FIELDS = {
     "output.bits": st.sampled_from([8, 16]),
 }
 
+POSE = ("type", "eye", "target", "up", "fov", "width", "focal", "principal")
+
 NEEDS = {
     "camera.width": ("camera.type", "orthographic"),
+    "camera.fov": ("camera.type", "perspective"),
+    "camera.focal": ("camera.type", "perspective"),
     "quadrature.step": ("quadrature.rule", "midpoint"),
 }
 EXCLUDES = [
@@ -92,8 +101,19 @@ EXCLUDES = [
     ("emission.ramp", "emission.constant"),
     ("emission.blackbody", "emission.constant"),
     ("background.color", "background.image"),
+    *combinations(["camera.fov", "camera.focal", "camera.width"], 2),
+    ("camera.principal", "camera.fov"),
+    ("camera.principal", "camera.width"),
+    *(("camera.transforms", f"camera.{name}") for name in POSE),
+    ("camera.frame", "camera.eye"),
 ]
-COMPANIONS = {"emission.constant": "emission.grid"}
+COMPANIONS = [
+    ("emission.constant", "emission.grid"),
+    ("camera.focal", "camera.eye"),
+    ("camera.focal", "camera.target"),
+    ("camera.principal", "camera.focal"),
+    ("camera.frame", "camera.transforms"),
+]
 
 
 @st.composite
@@ -103,7 +123,9 @@ def settings_of_a_job(draw):
     for one, other in EXCLUDES:
         if {one, other} <= chosen:
             chosen.remove(draw(st.sampled_from([one, other])))
-    chosen -= {key for key, other in COMPANIONS.items() if other not in chosen}
+    for key, other in COMPANIONS:
+        if other not in chosen:
+            chosen.discard(key)
     settings = {key: draw(FIELDS[key]) for key in sorted(chosen)}
     for key, (other, value) in NEEDS.items():
         if key in settings:
@@ -141,8 +163,11 @@ def test_a_setting_wins_over_the_file_and_the_file_over_the_default(written, set
         part, name = key.split(".")
         file.setdefault(part, {})[name] = value
     for key, (other, value) in NEEDS.items():  # what the settings leave without its companion
-        if key in written and settings.get(other, value) != value:
+        needed = any(k in settings and needs[0] == other for k, needs in NEEDS.items())
+        if key in written and settings.get(other, value) != value and not needed:
             settings.pop(other)
+    if "camera.transforms" in written and "camera.eye" not in settings:  # an eye replaces them
+        settings = {k: v for k, v in settings.items() if k not in {f"camera.{n}" for n in POSE}}
     job = make_job(file, list(settings.items()))
     dropped = {b for a, b in EXCLUDES if a in settings} | {a for a, b in EXCLUDES if b in settings}
     if "emission.constant" in settings:

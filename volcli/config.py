@@ -19,12 +19,22 @@ from volcli.errors import UsageError
 from volcli.schema import Job, field, keys, table_of
 from volcli.sources import SOURCES
 
-_FILES = ("density.file", "color.file", "emission.file", "background.image", "output.image")
+_FILES = (
+    "density.file",
+    "color.file",
+    "emission.file",
+    "camera.transforms",
+    "background.image",
+    "output.image",
+)
 """Fields that are paths: in a job file they are relative to the folder of that file."""
 
 _ANY = object()
 
 _EMITTED = ("grid", "ramp", "blackbody")
+
+_PINHOLE = ("fov", "focal", "principal")
+_POSE = ("type", "eye", "target", "up", "width", *_PINHOLE)
 
 _ENDS: list[tuple[str, Any, str]] = [
     *((f"color.{a}", _ANY, f"color.{b}") for a in SOURCES for b in SOURCES if a != b),
@@ -39,6 +49,18 @@ _ENDS: list[tuple[str, Any, str]] = [
     ("background.color", _ANY, "background.image"),
     ("background.image", _ANY, "background.color"),
     ("camera.type", "perspective", "camera.width"),
+    ("camera.type", "panorama", "camera.width"),
+    *(
+        ("camera.type", kind, f"camera.{n}")
+        for kind in ("orthographic", "panorama")
+        for n in _PINHOLE
+    ),
+    ("camera.focal", _ANY, "camera.fov"),
+    ("camera.fov", _ANY, "camera.focal"),
+    ("camera.fov", _ANY, "camera.principal"),
+    ("camera.eye", _ANY, "camera.transforms"),
+    ("camera.eye", _ANY, "camera.frame"),
+    *(("camera.transforms", _ANY, f"camera.{name}") for name in _POSE),
     ("quadrature.rule", "exact", "quadrature.step"),
 ]
 """(key, value, other key): the first, set on the command line, drops the other that a file set.
@@ -208,6 +230,9 @@ _KINDS = {
 }
 
 _LISTS = {
+    "camera.focal": "a list of 2 numbers, [across, down]",
+    "camera.principal": "a list of 2 numbers, [x, y]",
+    "camera.resolution": "a list of 2 whole numbers, [width, height]",
     "density.ramp.stops": "a list of [value, density] pairs",
     "stops": "a list of [value, R, G, B] rows of numbers",
     "range": "a list of 2 numbers, [low, high]",
