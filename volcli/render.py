@@ -27,6 +27,9 @@ Floats = NDArray[np.float32]
 MAX_STEPS = 10_000_000
 """Samples of the midpoint rule along one ray at most: beyond, a picture would never be done."""
 
+Window = tuple[int, int, int, int]
+"""A rectangle of an image's pixels: left, top, width, height."""
+
 TILE = 64
 """Edge of a tile in pixels: its rays share bricks, and there are enough tiles for all threads."""
 
@@ -96,6 +99,7 @@ def render(
     camera: Camera,
     *,
     threads: int | None = None,
+    window: Window | None = None,
     on_compiled: Callable[[], None] | None = None,
     progress: Progress | None = None,
 ) -> RenderResult:
@@ -107,6 +111,8 @@ def render(
         What, how and from where.
     threads
         Default: the processors that this process may use. The image does not depend on it.
+    window
+        The part of the image to render; its pixels are, to the bit, those of the whole image.
     on_compiled
         Called once the kernel is ready.
     progress
@@ -120,7 +126,7 @@ def render(
         If the midpoint rule's step is so short that a ray would take more than `MAX_STEPS`.
     """
     _check_step(scene.density, plan)
-    width, height = camera.resolution
+    left, top, width, height = window or (0, 0, *camera.resolution)
 
     def layer(value: float, *channels: int) -> Floats:
         return np.full((height, width, *channels), value, np.float32)
@@ -141,7 +147,11 @@ def render(
         rows = slice(corner[0], min(corner[0] + edge, height))
         columns = slice(corner[1], min(corner[1] + edge, width))
         shape = (samples, *tau[rows, columns].shape)
-        origins, directions = camera.rays(rows, columns, camera.samples)
+        origins, directions = camera.rays(
+            slice(top + rows.start, top + rows.stop),
+            slice(left + columns.start, left + columns.stop),
+            camera.samples,
+        )
         ray_tau, ray_light, ray_distance, evaluations = integrate(origins, directions)
         ray_opacity = -np.expm1(-ray_tau)
         if constant is not None:
@@ -179,7 +189,7 @@ def render(
         compile_seconds=compiled - begin,
         render_seconds=time.perf_counter() - compiled,
     )
-    _check_finite(result)
+    _check_finite(result, left, top)
     return result
 
 
@@ -276,13 +286,13 @@ def _check_step(grid: BrickGrid, plan: Plan) -> None:
         )
 
 
-def _check_finite(result: RenderResult) -> None:
+def _check_finite(result: RenderResult, left: int, top: int) -> None:
     bad = ~np.isfinite(result.optical_depth) | ~np.isfinite(result.radiance).all(axis=-1)
     if result.depth is not None:
         bad |= np.isnan(result.depth)
     if bad.any():
         y, x = (int(v) for v in np.argwhere(bad)[0])
         raise NonFiniteError(
-            f"{int(bad.sum())} pixels are NaN or Inf, the first at x={x}, y={y} (optical depth "
+            f"{int(bad.sum())} pixels are NaN or Inf, the first at x={left + x}, y={top + y} (optical depth "
             f"{result.optical_depth[y, x]:g}); a smaller density.scale may help"
         )

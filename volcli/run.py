@@ -31,7 +31,7 @@ from volcli.grids import (
     open_volume,
 )
 from volcli.plan import Plan, make_plan
-from volcli.render import RenderResult, Scene, over, render
+from volcli.render import RenderResult, Scene, Window, over, render
 from volcli.schema import DEFAULT_FOV, Job
 
 UNKNOWN_BOX = np.array([[-1.0] * 3, [1.0] * 3])
@@ -224,9 +224,10 @@ def render_loaded(
     loaded: Loaded,
     *,
     threads: int | None = None,
+    window: Window | None = None,
     on_stage: OnStage = lambda stage, done, total: None,
 ) -> Rendered:
-    """The first half of `run`: the arrays of a picture."""
+    """The first half of `run`: the arrays of a picture, or of a part of it."""
     plan, density = prepared.plan, loaded.density
     box = UNKNOWN_BOX if density.is_empty else density.world_box()
     job = _resolved(prepared.job, make_camera(prepared.job.camera, box))
@@ -238,6 +239,7 @@ def render_loaded(
         plan,
         camera,
         threads=threads,
+        window=window,
         on_compiled=lambda: on_stage("compiling", 1, 1),
         progress=lambda d, n: on_stage("rendering", d, n),
     )
