@@ -19,7 +19,7 @@ from volcli.errors import UsageError
 from volcli.schema import Job, field, keys, table_of
 from volcli.sources import SOURCES
 
-_FILES = (
+PATHS = (
     "density.file",
     "color.file",
     "emission.file",
@@ -115,8 +115,19 @@ def read_job_file(path: Path) -> dict[str, Any]:
     UsageError
         If the file cannot be read, or is not TOML.
     """
+    return from_folder(read_toml(path), path.parent)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The tables of a TOML file.
+
+    Raises
+    ------
+    UsageError
+        If the file cannot be read, or is not TOML.
+    """
     try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise UsageError(f"{path}: no such job file; check the path") from error
     except OSError as error:
@@ -125,12 +136,19 @@ def read_job_file(path: Path) -> dict[str, Any]:
         raise UsageError(f"{path}: is not a text file in UTF-8") from error
     except tomllib.TOMLDecodeError as error:
         raise UsageError(f"{path}: is not TOML: {error}") from error
-    for key in _FILES:
+
+
+def from_folder(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Tables of a job with their paths, which are relative to a folder, made relative to where the
+    user stands.
+    """
+    moved = copy.deepcopy(dict(tables))
+    for key in PATHS:
         part, name = key.split(".")
-        table = tables.get(part)
+        table = moved.get(part)
         if isinstance(table, dict) and isinstance(table.get(name), str):
-            table[name] = str(path.parent / table[name])
-    return tables
+            table[name] = str(folder / table[name])
+    return moved
 
 
 def parse_setting(text: str) -> tuple[str, Any]:

@@ -293,6 +293,6 @@ def _check_finite(result: RenderResult, left: int, top: int) -> None:
     if bad.any():
         y, x = (int(v) for v in np.argwhere(bad)[0])
         raise NonFiniteError(
-            f"{int(bad.sum())} pixels are NaN or Inf, the first at x={left + x}, y={top + y} (optical depth "
-            f"{result.optical_depth[y, x]:g}); a smaller density.scale may help"
+            f"{int(bad.sum())} pixels are NaN or Inf, the first at x={left + x}, y={top + y} "
+            f"(optical depth {result.optical_depth[y, x]:g}); a smaller density.scale may help"
         )
