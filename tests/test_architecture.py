@@ -16,7 +16,7 @@ LAYERS = [
     {"errors", "fields", "srgb", "blackbody"},
     {"sources", "grids", "quadrature"},
     {"schema"},
-    {"plan", "camera", "kernels", "tables"},
+    {"plan", "camera", "transforms", "kernels", "tables"},
     {"render"},
     {"config", "images"},
     {"run", "describe"},

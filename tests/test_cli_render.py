@@ -175,7 +175,7 @@ FLAGS = [
 
 def resolved(*arguments):
     """The job that ``volcli render ARGUMENTS`` makes of its arguments, as plain data."""
-    with mock.patch("volcli.run.prepare", side_effect=KeyboardInterrupt) as prepare:
+    with mock.patch("volcli.run.prepare_each", side_effect=KeyboardInterrupt) as prepare:
         ran = volcli("render", *arguments)
     assert prepare.call_args is not None, ran.err
     return prepare.call_args.args[0].model_dump(mode="json")

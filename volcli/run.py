@@ -33,6 +33,7 @@ from volcli.grids import (
 from volcli.plan import Plan, make_plan
 from volcli.render import RenderResult, Scene, Window, over, render
 from volcli.schema import DEFAULT_FOV, Job
+from volcli.transforms import each_camera
 
 UNKNOWN_BOX = np.array([[-1.0] * 3, [1.0] * 3])
 """(2, 3) world units: what is framed where there is no volume to frame."""
@@ -62,7 +63,7 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Loaded:
-    """The grids that a job needs, in memory.
+    """The grids that a job needs, in memory; those of one of its pictures are those of each.
 
     Attributes
     ----------
@@ -130,7 +131,26 @@ class Report:
 
 
 def prepare(job: Job, *, overwrite: bool = True, writes: bool = True) -> Prepared:
+    """`prepare_each` of a job that asks for one picture.
+
+    Raises
+    ------
+    UsageError
+        Also if it asks for several.
+    """
+    pictures = prepare_each(job, overwrite=overwrite, writes=writes)
+    if len(pictures) > 1:
+        raise UsageError(
+            f'camera.frame = "all": {len(pictures)} pictures where one is wanted; give a number'
+        )
+    return pictures[0]
+
+
+def prepare_each(job: Job, *, overwrite: bool = True, writes: bool = True) -> tuple[Prepared, ...]:
     """Open and check all that a job names, before any work: volume, grids, outputs, background.
+
+    A job asks for one picture, or for one from each of the cameras of ``camera.transforms``. They
+    have their volume, their plan and what `load` reads in common.
 
     Parameters
     ----------
@@ -142,26 +162,36 @@ def prepare(job: Job, *, overwrite: bool = True, writes: bool = True) -> Prepare
     UsageError, VolumeError, OutputError
         Whatever is wrong first.
     """
-    files = outputs(job)
-    if writes and not files:
+    jobs = each_camera(job)
+    files = [outputs(one) for one in jobs]
+    if writes and not files[0]:
         raise UsageError("nothing to write: give -o OUT.exr (or output.image in the job)")
-    for path in files.values():
+    for path in (path for of_one in files for path in of_one.values()):
         images.check_output(path, overwrite=overwrite)
     if job.density.file is None:
         raise UsageError("no volume: the job has no density.file; give one")
-    if job.camera.eye is not None and job.camera.target is not None:
-        make_camera(job.camera, UNKNOWN_BOX)  # raises now what needs no volume to be known
+    for camera in (one.camera for one in jobs):
+        if camera.eye is not None and camera.target is not None:
+            make_camera(camera, UNKNOWN_BOX)  # raises now what needs no volume to be known
     volume = open_volume(job.density.file, job.density.reader)
     layers = {"picture", *job.output.maps}
-    if not files or files["picture"].suffix.lower() == ".exr":
+    if not files[0] or files[0]["picture"].suffix.lower() == ".exr":
         layers |= {"transmittance", "optical_depth", "depth"}
     plan = make_plan(job, volume, frozenset(layers))
-    background = None
+    behind = {size: _background(job, size) for size in {one.camera.size for one in jobs}}
+    return tuple(
+        Prepared(one, volume, plan, of_one, behind[one.camera.size])
+        for one, of_one in zip(jobs, files, strict=True)
+    )
+
+
+def _background(job: Job, size: tuple[int, int]) -> Any:
+    """What is behind the volume in a picture of that size: (4,), (h, w, 4), or None."""
     if job.background.color is not None:
-        background = np.array([*job.background.color, 1.0], np.float32)
-    elif job.background.image is not None:
-        background = images.read_background(job.background.image, job.camera.size)
-    return Prepared(job, volume, plan, files, background)
+        return np.array([*job.background.color, 1.0], np.float32)
+    if job.background.image is not None:
+        return images.read_background(job.background.image, size)
+    return None
 
 
 def load(

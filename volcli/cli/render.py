@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -127,7 +127,7 @@ def render(
     spelled = {key: f"{flag} {_typed(text)}" for key, flag, text, _ in flags if text is not None}
     spelled |= {key: f"--background {background}" for key, _ in behind}
     from volcli.config import load_job
-    from volcli.run import load, prepare, run
+    from volcli.run import load, prepare_each, run
 
     job = load_job(
         source,
@@ -135,7 +135,8 @@ def render(
         settings=settings or [],
         spelled=spelled,
     )
-    prepared = prepare(job, overwrite=overwrite, writes=not explain)
+    pictures = prepare_each(job, overwrite=overwrite, writes=not explain)
+    prepared = pictures[0]
     with Bars(quiet) as bars:
         loaded = load(prepared, bars, cache)
         held = {prepared.plan.density.label: loaded.density.nbytes}
@@ -150,19 +151,23 @@ def render(
             return
         if explain and not as_json:
             say()
-        report = run(prepared, loaded, threads=threads, overwrite=overwrite, on_stage=bars)
-
-    _warn(report.warnings)
-    if not quiet and None in (job.camera.eye, job.camera.target):
-        print(f"volcli: camera chosen: {_camera_flags(report.camera)}", file=sys.stderr)
-    if as_json:
-        printed = asdict(report)
-        del printed["camera"]
-        if explain:
-            printed["plan"] = _plan(prepared.plan, held)
-        say(json.dumps(printed, allow_nan=False))
-    else:
-        say(_summary(report))
+        told: set[str] = set()
+        for picture in pictures:
+            report = run(picture, loaded, threads=threads, overwrite=overwrite, on_stage=bars)
+            loaded = replace(loaded, seconds=0.0)  # once for all
+            _warn([warning for warning in report.warnings if warning not in told])
+            told.update(report.warnings)
+            asked = picture.job.camera
+            if not quiet and None in (asked.eye, asked.target):
+                print(f"volcli: camera chosen: {_camera_flags(report.camera)}", file=sys.stderr)
+            if as_json:
+                printed = asdict(report)
+                del printed["camera"]
+                if explain:
+                    printed["plan"] = _plan(picture.plan, held)
+                say(json.dumps(printed, allow_nan=False))
+            else:
+                say(_summary(report))
 
 
 def _typed(value: Any) -> str:
@@ -197,7 +202,11 @@ def _explained(plan: Plan, held: dict[str, int]) -> str:
 def _camera_flags(camera: dict[str, Any]) -> str:
     """A camera as the flags that ask for it."""
     eye, target = (",".join(f"{v:.6g}" for v in camera[name]) for name in ("eye", "target"))
-    lens = f"--ortho {camera['width']:.6g}" if "width" in camera else f"--fov {camera['fov']:g}"
+    lens = {
+        "perspective": "--fov {fov:g}",
+        "orthographic": "--ortho {width:.6g}",
+        "panorama": "--set camera.type=panorama",
+    }[camera["type"]].format_map(camera)
     up = ",".join(f"{v:.6g}" for v in camera["up"])
     tilt = "" if up == "0,1,0" else f" --up {up}"
     return f"--eye {eye} --target {target}{tilt} {lens}"
