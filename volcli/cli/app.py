@@ -17,6 +17,7 @@ _ParserError: Any = typer.BadParameter.__mro__[2]
 COMMANDS = {
     "render": "Render a picture of a volume.",
     "info": "List the grids of a volume.",
+    "inspect": "Look at the opacity of images.",
 }
 """The commands, each a function of its name in the module of its name, and their summaries."""
 

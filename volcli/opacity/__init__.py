@@ -6,6 +6,7 @@ findings.py     numbers to sentences: empty, thin, solid, clipped, banded, not p
 heatmap.py      a map in colours, with a colour bar and contour lines
 blocks.py       a small picture in the characters of a terminal
 page.py         one HTML file to look at images with
+colormap.py     colour maps by name, and where values lie in one
 background.py   another background behind a picture that is already rendered
 difference.py   two images, channel by channel
 

@@ -12,8 +12,11 @@ from typing import Any
 THIN = 0.1
 """A volume of less optical depth than this nearly everywhere looks empty: opacity below 10 %."""
 
-SOLID = 10.0
-"""A volume of more optical depth than this nearly everywhere looks solid: T below 5e-5."""
+SOLID = 7.0
+"""A volume of more optical depth than this over most of it looks solid: T below 0.001."""
+
+OPAQUE_SHARE = 0.9
+"""Where more of what is visible than this is opaque to the last digit, the picture is solid."""
 
 FEW_LEVELS = 64
 """Fewer levels of opacity than this over a picture show as bands."""
@@ -74,7 +77,7 @@ def _visibility(numbers: dict[str, Any]) -> list[tuple[str, str]]:
     tau = numbers["maps"]["optical_depth"]
     scale = numbers["density_scale"]
     if tau["percentiles"] is not None:
-        median, most = tau["percentiles"]["50"], tau["percentiles"]["99"]
+        least, median, most = (tau["percentiles"][q] for q in ("25", "50", "99"))
         advice = (
             f"{scale_advice(scale, median)} (now {scale:g})"
             if scale is not None
@@ -82,11 +85,11 @@ def _visibility(numbers: dict[str, Any]) -> list[tuple[str, str]]:
         )
         if most < THIN:
             found.append(("thin", f"optical depth is {median:.3g} in the median: {advice}"))
-        elif median > SOLID:
+        elif least > SOLID:
             found.append(("solid", f"optical depth is {median:.3g} in the median: {advice}"))
     visible = numbers["coverage"]["above_0"]
     saturated = numbers["coverage"]["saturated"]
-    if saturated > 0.5 * visible and not any(kind == "solid" for kind, _ in found):
+    if saturated > OPAQUE_SHARE * visible and not any(kind == "solid" for kind, _ in found):
         found.append(
             (
                 "solid",
@@ -94,8 +97,8 @@ def _visibility(numbers: dict[str, Any]) -> list[tuple[str, str]]:
                 f"tell; a smaller --density-scale shows what is inside",
             )
         )
-    colour = numbers["colour"]
-    if colour is not None and not colour["over_background"] and colour["max"] < 0.01:
+    colour, most_opaque = numbers["colour"], numbers["maps"]["opacity"]["max"]
+    if colour is not None and not colour["over_background"] and colour["max"] < 0.01 * most_opaque:
         found.append(
             (
                 "black",

@@ -23,6 +23,9 @@ Floats = NDArray[np.float32]
 MAP_HEADER = "volcli:map"
 """The header entry that names the map in a file that holds nothing else."""
 
+NO_ALPHA = "no alpha: opaque"
+"""The source of opacity of an image that says nothing of it."""
+
 
 @dataclass(frozen=True)
 class Maps:
@@ -103,7 +106,7 @@ def read_maps(path: str | os.PathLike[str]) -> Maps:
     elif stored.file_format == "png" and stored.find("R") is not None:
         # volcli leaves alpha out of a PNG whose every pixel is opaque.
         opacity = np.ones(stored.size[::-1], np.float32)
-        source["opacity"] = "no alpha: opaque"
+        source["opacity"] = NO_ALPHA
     else:
         raise UsageError(
             f"{stored.path}: no alpha, and no layer of volcli's; it has: "

@@ -1,0 +1,83 @@
+"""Another background behind a picture that is already rendered: C = C_volume + T c_background.
+
+An EXR of volcli holds the volume's transmittance beside the picture, so the light that came through
+from the old background can be taken away again.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from volcli.errors import UsageError
+from volcli.images import linear_from_srgb, read_background
+from volcli.opacity.maps import NO_ALPHA, Floats, Maps
+
+
+def radiance_of(maps: Maps) -> Floats | None:
+    """(h, w, 3): the light of the volume alone, premultiplied and linear; None without colour.
+
+    Where a background was rendered, it is taken away: what the header's job names, times the
+    transmittance.
+
+    Raises
+    ------
+    UsageError
+        The background was an image that can no longer be read.
+    """
+    planes = [maps.stored.find(name) for name in "RGB"]
+    if any(plane is None for plane in planes):
+        return None
+    colour = np.stack(planes, axis=-1)  # type: ignore[arg-type]
+    if not maps.stored.associated:
+        return (linear_from_srgb(colour) * maps.opacity[..., None]).astype(np.float32)
+    behind = _rendered_background(maps)
+    if behind is None:
+        return colour
+    return colour - maps.transmittance[..., None] * behind[..., :3]
+
+
+def recomposite(maps: Maps, background: NDArray[np.float32] | None) -> Floats:
+    """(h, w, 4): the picture before another background, premultiplied and linear.
+
+    Parameters
+    ----------
+    background
+        (4,) or (h, w, 4), premultiplied and linear; None: nothing is behind the volume.
+
+    Raises
+    ------
+    UsageError
+        The image has no colour or no transparency left, or its background was an image that can no
+        longer be read.
+    """
+    if maps.source["opacity"] == NO_ALPHA:
+        raise UsageError(
+            f"{maps.stored.path}: has no alpha, so nothing of what is behind can be changed; "
+            f"render an .exr"
+        )
+    radiance = radiance_of(maps)
+    if radiance is None:
+        raise UsageError(f"{maps.stored.path}: has no channels R, G and B to put before another")
+    picture = np.dstack([radiance, maps.opacity])
+    if background is None:
+        return picture
+    return picture + maps.transmittance[..., None] * np.asarray(background, np.float32)
+
+
+def _rendered_background(maps: Maps) -> Floats | None:
+    """(4,) or (h, w, 4): what the picture was rendered over; None: nothing."""
+    wanted = maps.job.get("background", {})
+    if "color" in wanted:
+        return np.array([*wanted["color"], 1.0], np.float32)
+    if "image" not in wanted:
+        return None
+    try:
+        return read_background(Path(wanted["image"]), maps.stored.size)
+    except UsageError as error:
+        raise UsageError(
+            f"{maps.stored.path}: was rendered over {wanted['image']}, which is needed to take "
+            f"that away: {error}"
+        ) from error
