@@ -18,7 +18,7 @@ LAYERS = [
     {"schema"},
     {"plan", "camera", "transforms", "kernels", "tables"},
     {"render"},
-    {"config", "images"},
+    {"config", "images", "warmup"},
     {"run", "describe"},
     {"cli"},
 ]

@@ -46,7 +46,7 @@ def test_compiling_is_announced_before_it_starts():
     with contextlib.redirect_stderr(screen):
         bars = Bars(quiet=False)
         bars("compiling", 0, 1)
-        assert "preparing kernels" in screen.getvalue()
+        assert "compiling kernels (first run" in screen.getvalue()
         bars("compiling", 1, 1)
     assert left_on(screen) == [""]
 

@@ -10,7 +10,7 @@ import re
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,16 +31,17 @@ from volcli.grids import (
     open_volume,
 )
 from volcli.plan import Plan, make_plan
-from volcli.render import RenderResult, Scene, Window, over, render
+from volcli.render import RenderResult, Scene, Window, make_integrator, over, render
 from volcli.schema import DEFAULT_FOV, Job
 from volcli.transforms import each_camera
+from volcli.warmup import StandIn, WarmUp
 
 UNKNOWN_BOX = np.array([[-1.0] * 3, [1.0] * 3])
 """(2, 3) world units: what is framed where there is no volume to frame."""
 
 OnStage = Callable[[str, int, int], None]
-"""Called as ``on_stage(stage, done, total)``; a stage is one of ``reading GRID``, ``compiling``,
-``rendering``, ``writing``.
+"""Called as ``on_stage(stage, done, total)``; a stage is one of ``reading GRID``, ``compiling`` (if
+there is something to compile), ``rendering``, ``writing``.
 """
 
 
@@ -73,12 +74,15 @@ class Loaded:
         What was changed in the values on the way.
     seconds
         How long reading took.
+    kernels
+        What will render them, being made ready; None where nothing is to be rendered.
     """
 
     density: BrickGrid
     color: BrickGrid | tuple[float, float, float]
     warnings: tuple[str, ...]
     seconds: float
+    kernels: WarmUp | None
 
 
 @dataclass(frozen=True)
@@ -199,7 +203,7 @@ def load(
     on_stage: OnStage = lambda stage, done, total: None,
     cache: Path | None = None,
 ) -> Loaded:
-    """Read the grids that the plan names.
+    """Read the grids that the plan names, and meanwhile begin to make the kernels ready.
 
     Parameters
     ----------
@@ -217,6 +221,7 @@ def load(
         return lambda done, total: on_stage(f"reading {header.label}", done, total)
 
     begin = time.perf_counter()
+    kernels = WarmUp(lambda: _use_kernels(prepared)) if prepared.files else None
     density, warnings = load_density(
         volume, plan.density, job.density.nonfinite, progress(plan.density), cache
     )
@@ -226,7 +231,7 @@ def load(
             volume, plan.color, job.density.nonfinite, progress(plan.color), cache
         )
         warnings = [*warnings, *(note for note in notes if note not in warnings)]
-    return Loaded(density, color, tuple(warnings), time.perf_counter() - begin)
+    return Loaded(density, color, tuple(warnings), time.perf_counter() - begin, kernels)
 
 
 def run(
@@ -263,22 +268,36 @@ def render_loaded(
     job = _resolved(prepared.job, make_camera(prepared.job.camera, box))
     # Made anew from what was chosen, so that the job in the header gives the same rays to the bit.
     camera = make_camera(job.camera, box)
-    on_stage("compiling", 0, 1)
+    waiting = time.perf_counter()
+    if loaded.kernels is not None:
+        loaded.kernels.wait(lambda done, total: on_stage("compiling", done, total))
+    waited = time.perf_counter() - waiting
     result = render(
-        Scene(density, job.density.scale, loaded.color),
+        _scene(prepared, loaded),
         plan,
         camera,
         threads=threads,
         window=window,
-        on_compiled=lambda: on_stage("compiling", 1, 1),
         progress=lambda d, n: on_stage("rendering", d, n),
     )
     seconds = {
         "load": loaded.seconds,
-        "compile": result.compile_seconds,
+        "compile": waited + result.compile_seconds,
         "render": result.render_seconds,
     }
     return Rendered(job, result, seconds, (*plan.warnings, *loaded.warnings))
+
+
+def _scene(prepared: Prepared, loaded: Loaded) -> Scene:
+    return Scene(loaded.density, prepared.job.density.scale, loaded.color)
+
+
+def _use_kernels(prepared: Prepared) -> None:
+    """Have no rays integrated through a stand-in for the volume, as the picture's will be."""
+    volume = StandIn(prepared.volume.path, prepared.volume.headers)
+    stand_in = replace(prepared, volume=volume, files={})
+    nothing = np.empty((0, 3))
+    make_integrator(_scene(stand_in, load(stand_in)), prepared.plan)(nothing, nothing)
 
 
 def write(

@@ -1,17 +1,24 @@
 """The command line: one file a command; each parses, calls one function and prints.
 
 This is the only place that prints and exits. Results go to stdout; progress, notes and errors to
-stderr. Here is the entry point alone, so that even an interrupt while modules load ends in order.
+stderr. Here is the entry point alone, so that even an interrupt while modules load ends in order,
+and what makes the process start and end sooner, before anything else is imported.
 """
 
 from __future__ import annotations
 
+import gc
+import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and exit; the entry point of the installed script."""
+    """Run the command line and exit; the installed script calls it without arguments."""
+    is_script = arguments is None
+    if is_script:
+        _start_sooner()
     try:
         from volcli.cli.app import run_app
 
@@ -19,4 +26,27 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("volcli: interrupted", file=sys.stderr)
         code = 130
+    if is_script:
+        _end_sooner(code)
     sys.exit(code)
+
+
+def _start_sooner() -> None:
+    """Settings of the process that save a tenth of the time of a small picture."""
+    # Libraries make some 400,000 objects as they load, all to stay. With Python's own threshold of
+    # 700 new ones they are searched for garbage again and again: 80 ms of 900.
+    gc.set_threshold(100_000)
+    # NumPy's linear algebra starts a thread for each processor (60 ms of their time, and it waits
+    # in a loop for work) for matrices that here are 4 x 4. `--threads` is to bind all there are.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def _end_sooner(code: int) -> None:
+    """End the process at once, rather than take 400,000 objects apart first: 100 ms of 900.
+
+    Nor does the process then wait for a compilation that goes on in a thread after an error.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError):  # whoever read it has gone; the code says how the work ended
+            stream.flush()
+    os._exit(code)

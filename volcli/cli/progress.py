@@ -53,7 +53,7 @@ def _open(stage: str, total: int) -> Any:
     from tqdm import tqdm
 
     if stage == _COMPILING:  # one step that cannot be counted: say it before it starts
-        text = "preparing kernels (the first time they are compiled: about 10 s)"
+        text = "compiling kernels (first run of this kind on this machine) ..."
         return tqdm(desc=text, total=total, leave=False, bar_format="{desc}", file=sys.stderr)
     unit = _UNITS[stage.partition(" ")[0]]
     return tqdm(

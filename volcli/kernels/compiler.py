@@ -22,12 +22,13 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core import config
+from numba.core import config, event
 
 _OPTIONS: dict[str, Any] = {
     "nogil": True,
@@ -50,6 +51,21 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
         return numba.njit(cache=True, **_OPTIONS)(function)
     finally:
         config.CACHE_DIR = before  # type: ignore[attr-defined]
+
+
+@contextmanager
+def when_compiling(call: Callable[[], None]) -> Iterator[None]:
+    """Call something as soon as a compilation begins; what the cache holds is loaded in silence."""
+
+    class Listener(event.Listener):
+        def on_start(self, _: Any) -> None:
+            call()
+
+        def on_end(self, _: Any) -> None:
+            pass
+
+    with event.install_listener("numba:compile", Listener()):
+        yield
 
 
 def _cache_folder() -> Path:
