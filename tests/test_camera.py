@@ -294,7 +294,7 @@ def test_a_panorama_from_outside_looks_at_the_middle_of_the_box():
 
 
 def test_focal_lengths_and_a_principal_point_are_those_of_a_pinhole():
-    """x = (column + 1/2 - cx) / f_x, y = (cy - row - 1/2) / f_y, at distance 1 before the camera."""
+    """At distance 1: x = (column + 1/2 - cx) / f_x, y = (cy - row - 1/2) / f_y."""
     lens = {"focal": (10, 20), "principal": (1.5, 7), "resolution": (4, 3)}
     camera = make_camera(Camera(eye=(0, 0, 0), target=(0, 0, -1), **lens), BOX)
     _, directions = camera.rays(ALL, ALL)
