@@ -4,7 +4,8 @@
     ├── UsageError       2   the command line or a job file asks for something impossible
     ├── VolumeError      3   a volume file is missing, damaged or not what was asked for
     ├── OutputError      4   a result could not be written
-    └── NonFiniteError   5   the result holds NaN or Inf
+    ├── NonFiniteError   5   the result holds NaN or Inf
+    └── BatchError       6   some jobs of a batch failed
 
 A message is one line: what, where, what to do. The library raises; only ``volcli.cli`` prints and
 exits. This module imports nothing.
@@ -39,3 +40,9 @@ class NonFiniteError(VolcliError):
     """The result holds NaN or Inf."""
 
     exit_code = 5
+
+
+class BatchError(VolcliError):
+    """Some jobs of a batch failed."""
+
+    exit_code = 6
