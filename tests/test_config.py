@@ -72,7 +72,7 @@ FIELDS = {
     "camera.up": vectors.filter(any),
     "camera.fov": st.floats(0, 180, exclude_min=True, exclude_max=True),
     "camera.width": positive,
-    "camera.focal": st.lists(positive, min_size=2, max_size=2),
+    "camera.focal": st.lists(st.floats(1e-6, 1e300), min_size=2, max_size=2),
     "camera.principal": st.lists(finite, min_size=2, max_size=2),
     "camera.transforms": paths,
     "camera.frame": st.one_of(st.integers(0, 10**9), st.just("all")),

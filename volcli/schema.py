@@ -24,6 +24,8 @@ DEFAULT_STEP = 0.5
 DEFAULT_FOV = 40.0
 DEFAULT_SIZES = {"perspective": (800, 600), "orthographic": (800, 600), "panorama": (1024, 512)}
 
+Focal = Annotated[Number, Field(ge=1e-6)]
+
 _LENS = {
     "fov": "perspective",
     "focal": "perspective",
@@ -88,8 +90,8 @@ class Camera(Part):
     )
     eye: Vector | None = Field(
         None,
-        description="Position X,Y,Z in world units. Absent: where all of the volume is seen, or for "
-        "a panorama in its middle.",
+        description="Position X,Y,Z in world units. Absent: where all of the volume is seen; for a "
+        "panorama, in its middle.",
     )
     target: Vector | None = Field(None, description="Point X,Y,Z looked at, in world units.")
     up: Vector = Field((0.0, 1.0, 0.0), description="Direction X,Y,Z that is up in the picture.")
@@ -101,7 +103,7 @@ class Camera(Part):
     width: Positive | None = Field(
         None, description="Width of an orthographic picture, in world units."
     )
-    focal: tuple[Positive, Positive] | None = Field(
+    focal: tuple[Focal, Focal] | None = Field(
         None,
         description="Focal lengths of a perspective camera across and down, in pixels; instead of "
         "fov, and with eye and target.",

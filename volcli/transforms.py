@@ -130,10 +130,12 @@ def _camera(frame: Mapping[str, Any], job: Camera) -> Camera:
     scale = wanted[0] / width
     _, upward, backward, eye = pose
     reach = max(1.0, float(np.abs(eye).max()))  # so that eye - target keeps its digits
+    with np.errstate(over="ignore"):  # Inf is refused below
+        target = eye - reach * backward
     try:
         return Camera(
             eye=_triple(eye),
-            target=_triple(eye - reach * backward),
+            target=_triple(target),
             up=_triple(upward),
             focal=(focal[0] * scale, focal[1] * scale),
             principal=(
