@@ -21,10 +21,10 @@ import numpy as np
 from benchmarks.common import write_results
 from volcli.camera import make_camera
 from volcli.config import load_job
-from volcli.grids import BrickGrid, load_color, load_density
+from volcli.grids import BrickGrid
 from volcli.plan import Plan
-from volcli.render import Scene, make_integrator
-from volcli.run import prepare
+from volcli.render import Source, make_integrator
+from volcli.run import load, prepare
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
@@ -39,18 +39,17 @@ def compare(path: Path, rays: int = RAYS, steps: Sequence[float] = STEPS) -> dic
     """Errors of the exact rule, and of midpoint at some steps, on one job."""
     # Nothing is written here, and the folder that the job writes to need not exist.
     prepared = prepare(load_job(path, [("output.image", None)]), writes=False)
-    job, plan, volume = prepared.job, prepared.plan, prepared.volume
-    density, _ = load_density(volume, plan.density, "error")
-    lattice = lattice_of(volume.read_tree(plan.density), density)
-    color: Any = job.color.value
+    job, plan, volumes = prepared.job, prepared.plan, prepared.volumes
+    assert plan.density is not None, "what is compared is the optical depth"
+    scene = load(prepared).scene
+    lattice = lattice_of(volumes.density.read_tree(plan.density), scene.density)
     color_lattice = None
-    if plan.color is not None:
-        color, _ = load_color(volume, plan.color, "error")
-        color_lattice = lattice_of(volume.read_tree(plan.color), color)
+    colored = isinstance(scene.color, Source) and scene.color.table is None
+    if colored and scene.emission is None and plan.color is not None:
+        color_lattice = lattice_of(volumes.color.read_tree(plan.color), scene.color.grid)
 
-    camera = make_camera(job.camera, density.world_box())
+    camera = make_camera(job.camera, scene.density.world_box())
     origins, directions = camera.rays(slice(None), slice(None))
-    scene = Scene(density, job.density.scale, color)
     tau = make_integrator(scene, _variant(plan, None))(origins, directions)[0]
     hit = np.flatnonzero(tau > 1e-3)
     chosen = np.random.default_rng(1).choice(hit, min(rays, len(hit)), replace=False)
@@ -61,7 +60,7 @@ def compare(path: Path, rays: int = RAYS, steps: Sequence[float] = STEPS) -> dic
     for step in (None, *steps):
         seen = make_integrator(scene, _variant(plan, step))(origins, directions)
         found["exact" if step is None else f"midpoint {step:g}"] = _errors(
-            seen, truth, isinstance(color, BrickGrid)
+            seen, truth, color_lattice is not None
         )
     if steps:
         means = [found[f"midpoint {step:g}"]["transmittance_mean"] for step in steps]

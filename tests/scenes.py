@@ -11,7 +11,7 @@ from volcli.camera import make_camera
 from volcli.grids.build import build
 from volcli.grids.tree import GridHeader, Tree
 from volcli.plan import make_plan
-from volcli.render import Scene, render
+from volcli.render import Scene, Source, render
 from volcli.schema import Camera, Job
 
 EVERYTHING = frozenset({"picture", "transmittance", "opacity", "optical_depth", "depth"})
@@ -156,7 +156,7 @@ def plan_for(layers=EVERYTHING, step=None, nearest=False):
 
 def shoot(density, view, scale=1.0, colour=(1.0, 1.0, 1.0), threads=1, **plan):
     """Render a medium with volcli."""
-    color = colour.grid if isinstance(colour, Medium) else colour
+    color = Source(colour.grid) if isinstance(colour, Medium) else colour
     scene = Scene(density.grid, scale, color)
     camera = view.camera if isinstance(view, View) else view
     return render(scene, plan_for(**plan), camera, threads=threads)

@@ -18,7 +18,7 @@ LAYERS = [
     {"schema"},
     {"plan", "camera", "transforms", "kernels", "tables"},
     {"render"},
-    {"config", "images", "warmup"},
+    {"config", "images", "warmup", "scene"},
     {"run", "describe"},
     {"cli"},
 ]

@@ -11,7 +11,9 @@ from commandline import VOLUMES, volcli, write_ball, write_grid
 
 from volcli.errors import VolumeError
 from volcli.grids import cache as caching
-from volcli.grids import load_color, load_density, open_volume
+from volcli.grids import load_density, load_source, open_volume
+from volcli.grids.dense import DenseVolume
+from volcli.grids.vdb import VdbFile
 from volcli.images import read_exr
 
 SMALL = ("--size", "16x12", "--quiet")
@@ -50,16 +52,14 @@ def entries(folder):
 
 def no_reading(monkeypatch):
     """From here on only the cache can give bricks."""
-    for name in ("_read_density", "_read_color"):
-        stub = lambda *_: pytest.fail("the file was read")  # noqa: E731
-        stub.__name__ = name
-        monkeypatch.setattr(f"volcli.grids.{name}", stub)
+    for reader in (DenseVolume, VdbFile):
+        monkeypatch.setattr(reader, "read_tree", lambda *_: pytest.fail("the file was read"))
 
 
 @pytest.mark.parametrize("label", ["density", "Cd"])
 def test_the_second_load_is_the_first_with_its_warnings(ball, tmp_path, monkeypatch, label):
     folder = tmp_path / "a" / "cache"
-    reader = load_color if label == "Cd" else load_density
+    reader = load_source if label == "Cd" else load_density
     plain, warned = load(ball, None, label, reader=reader)
     assert len(warned) == (2 if label == "density" else 0)
     first, first_warned = load(ball, folder, label, reader=reader)
@@ -104,7 +104,7 @@ def test_a_file_that_was_moved_is_found_and_warned_of_by_its_new_name(ball, tmp_
 def test_each_grid_setting_and_state_of_the_file_has_its_own_entry(ball, tmp_path, monkeypatch):
     folder = tmp_path / "cache"
     load(ball, folder)
-    load(ball, folder, "Cd", reader=load_color)
+    load(ball, folder, "Cd", reader=load_source)
     assert len(entries(folder)) == 2
     with pytest.raises(VolumeError, match="NaN"):
         load(ball, folder, nonfinite="error")  # never out of the entry that took NaN as 0

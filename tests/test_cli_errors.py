@@ -78,11 +78,11 @@ WRONG = {
         3,
         "it has: density.*mean 'density'",
     ),
-    "level set": ("set.vdb -o a.exr", 3, r"'\[0\]' is a level set.*not a fog volume; convert it"),
+    "level set": ("set.vdb -o a.exr", 3, r"'\[0\]' is a level set.*not a fog volume; take it as fog with --set density.level_set=fog"),
     "vectors as density": ("ball.npz -o a.exr --grid Cd", 3, "a scalar; choose another .*density"),
     "only vectors": ("vectors.vdb -o a.exr", 3, "'v' is vec3s, and a density is a scalar"),
     "unknown colour": ("ball.npz -o a.exr --color-grid cd", 3, "did you mean 'Cd'"),
-    "scalar as colour": ("ball.npz -o a.exr --color-grid density", 3, "a colour is vec3; .*Cd"),
+    "scalar as colour": ("ball.npz -o a.exr --color-grid density", 3, "color.grid is vec3; .*Cd"),
     "no colour": ("fog.vdb -o a.exr --color-grid density", 3, "give one colour with --color"),
     # numbers
     "step 0": ("ball.npz -o a.exr --step 0", 2, "^--step 0: must be above 0$"),
@@ -214,7 +214,7 @@ def test_nan_is_rendered_as_nothing_where_the_job_accepts_it(folder):
 def test_an_empty_volume_renders_its_background_and_says_so(folder):
     ran = volcli("render", "empty_grid.vdb", "-o", "a.exr", *SMALL, "--background", "1,0.5,0")
     assert ran.code == 0
-    assert "is empty; there is nothing to see but the background" in ran.err
+    assert "is empty; it absorbs nothing" in ran.err
     channels, _ = read_exr("a.exr")
     assert [float(channels[c].min()) for c in "RGBA"] == [1, 0.5, 0, 1]
     assert float(channels["transmittance.Y"].min()) == 1

@@ -21,6 +21,7 @@ from volcli.camera import Camera
 from volcli.errors import NonFiniteError, UsageError
 from volcli.grids import BrickGrid, Progress
 from volcli.plan import Plan
+from volcli.tables import ColorTable, TransferTable
 
 Floats = NDArray[np.float32]
 
@@ -35,6 +36,25 @@ TILE = 64
 
 
 @dataclass(frozen=True)
+class Source:
+    """Radiance, or emission, that varies from point to point.
+
+    Attributes
+    ----------
+    grid
+        A grid of three channels, or one of one channel with a table.
+    table
+        The colour of a value of a grid of one channel; None where there are three.
+    scale
+        What the values of a grid of three channels are multiplied by.
+    """
+
+    grid: BrickGrid
+    table: ColorTable | None = None
+    scale: float = 1.0
+
+
+@dataclass(frozen=True)
 class Scene:
     """What is rendered.
 
@@ -45,12 +65,21 @@ class Scene:
     scale
         Extinction per unit of density, 1 / world unit.
     color
-        A grid of radiance, or one radiance (r, g, b).
+        A source of radiance, or one radiance (r, g, b).
+    emission
+        A source of radiance per world unit, 0 outside its grid's support; or None.
+    tint
+        Factors (r, g, b) of the extinction, or None.
+    transfer
+        Density by the value of the grid, before ``scale``; None: the value itself.
     """
 
     density: BrickGrid
     scale: float
-    color: BrickGrid | tuple[float, float, float]
+    color: Source | tuple[float, float, float]
+    emission: Source | None = None
+    tint: tuple[float, float, float] | None = None
+    transfer: TransferTable | None = None
 
 
 @dataclass(frozen=True)
@@ -62,10 +91,12 @@ class RenderResult:
     radiance
         (h, w, 3) float32: light of the volume alone, so premultiplied.
     optical_depth, transmittance, opacity
-        (h, w) float32: tau, exp(-tau) and 1 - exp(-tau), each rounded once from float64.
+        (h, w) float32: tau, exp(-tau) and 1 - exp(-tau), each rounded once from float64. Under a
+        tint (h, w, 3), a channel each: tint_c tau, ...
     depth
         (h, w) float32: the expected hit distance along the camera's axis (of a panorama: along the
-        ray), world units, +inf where nothing can be hit; None when the plan leaves it out.
+        ray), world units, +inf where nothing can be hit; None when the plan leaves it out. A tint
+        leaves it as it is.
 
     Of a pixel with several samples each is the mean over them. For optical depth that is what lies
     behind the pixel on average (mass over area), no longer -log of the mean transmittance, which
@@ -86,6 +117,13 @@ class RenderResult:
     evaluations: int
     compile_seconds: float
     render_seconds: float
+
+    @property
+    def alpha(self) -> Floats:
+        """(h, w) float32: opacity, the mean over its channels where there are three."""
+        if self.opacity.ndim == 2:
+            return self.opacity
+        return self.opacity.mean(axis=-1, dtype=np.float64).astype(np.float32)
 
 
 def available_threads() -> int:
@@ -131,7 +169,10 @@ def render(
     def layer(value: float, *channels: int) -> Floats:
         return np.full((height, width, *channels), value, np.float32)
 
-    tau, transmittance, opacity, light = layer(0), layer(1), layer(0), layer(0, 3)
+    tint = None if scene.tint is None else np.array(scene.tint)
+    channels = () if tint is None else (3,)
+    tau, transmittance, opacity = (layer(value, *channels) for value in (0, 1, 0))
+    light = layer(0, 3)
     depth = layer(np.inf) if plan.depth else None
     constant = np.array(scene.color) if isinstance(scene.color, tuple) else None
 
@@ -153,24 +194,27 @@ def render(
             camera.samples,
         )
         ray_tau, ray_light, ray_distance, evaluations = integrate(origins, directions)
-        ray_opacity = -np.expm1(-ray_tau)
+        ray_opacity = ray_hit = -np.expm1(-ray_tau)
+        if tint is not None:
+            ray_tau = ray_tau[:, None] * tint
+            ray_opacity = -np.expm1(-ray_tau)
         if constant is not None:
-            ray_light = ray_opacity[:, None] * constant
+            ray_light = ray_light + ray_opacity.reshape(len(ray_light), -1) * constant
         with np.errstate(over="ignore"):  # beyond float32 it is Inf, and reported as such
-            tau[rows, columns] = _mean(ray_tau.reshape(shape))
-        transmittance[rows, columns] = _mean(np.exp(-ray_tau).reshape(shape))
-        opacity[rows, columns] = _mean(ray_opacity.reshape(shape))
+            tau[rows, columns] = _mean(ray_tau.reshape(*shape, *channels))
+        transmittance[rows, columns] = _mean(np.exp(-ray_tau).reshape(*shape, *channels))
+        opacity[rows, columns] = _mean(ray_opacity.reshape(*shape, *channels))
         light[rows, columns] = _mean(ray_light.reshape(*shape, 3))
         if depth is not None:
             ray_depth = ray_distance * camera.depth_per_distance(directions)
-            depth[rows, columns] = _mean_depth(ray_depth.reshape(shape), ray_opacity.reshape(shape))
+            depth[rows, columns] = _mean_depth(ray_depth.reshape(shape), ray_hit.reshape(shape))
         return evaluations
 
     evaluations = 0
     samples = len(camera.samples)
     edge = max(1, TILE // (math.isqrt(samples - 1) + 1))  # of about as many rays for any samples
     tiles = [(y, x) for y in range(0, height, edge) for x in range(0, width, edge)]
-    if not scene.density.is_empty:
+    if not (scene.density.is_empty and (scene.emission is None or scene.emission.grid.is_empty)):
         pool = ThreadPoolExecutor(threads or available_threads())
         try:
             for done, count in enumerate(pool.map(one_tile, tiles), start=1):
@@ -223,10 +267,14 @@ def over(result: RenderResult, background: Floats | None) -> Floats:
     background
         (h, w, 4), or (4,), premultiplied; None: nothing is behind the volume.
     """
+    picture: Floats = np.dstack([result.radiance, result.alpha])
     if background is None:
-        return np.dstack([result.radiance, result.opacity])
-    behind = result.transmittance[..., None] * np.asarray(background, np.float32)
-    return np.dstack([result.radiance, result.opacity]) + behind
+        return picture
+    behind = np.asarray(background, np.float32)
+    if result.transmittance.ndim == 2:
+        return picture + result.transmittance[..., None] * behind
+    seen: Floats = np.dstack([result.transmittance, 1 - result.alpha])
+    return picture + seen * behind
 
 
 def make_integrator(
@@ -243,14 +291,15 @@ def make_integrator(
         grid.arrays, grid.local_from_world, grid.support(interpolation), float(scene.scale)
     )
     colour = None
-    if isinstance(scene.color, BrickGrid):
-        same = np.array_equal(grid.world_from_index, scene.color.world_from_index)
+    if isinstance(scene.color, Source):
+        source = scene.color.grid
+        same = np.array_equal(grid.world_from_index, source.world_from_index)
         colour = Colour(
-            scene.color.arrays,
-            scene.color.local_from_world,
+            source.arrays,
+            source.local_from_world,
             True if same else None,
-            grid.origin - scene.color.origin,
-            scene.color.brightest,
+            grid.origin - source.origin,
+            source.brightest,
         )
 
     def integrate(origins: NDArray[Any], directions: NDArray[Any]) -> tuple[Any, ...]:
@@ -287,12 +336,13 @@ def _check_step(grid: BrickGrid, plan: Plan) -> None:
 
 
 def _check_finite(result: RenderResult, left: int, top: int) -> None:
-    bad = ~np.isfinite(result.optical_depth) | ~np.isfinite(result.radiance).all(axis=-1)
+    tau = result.optical_depth.reshape(*result.radiance.shape[:2], -1)
+    bad = ~np.isfinite(tau).all(axis=-1) | ~np.isfinite(result.radiance).all(axis=-1)
     if result.depth is not None:
         bad |= np.isnan(result.depth)
     if bad.any():
         y, x = (int(v) for v in np.argwhere(bad)[0])
         raise NonFiniteError(
             f"{int(bad.sum())} pixels are NaN or Inf, the first at x={left + x}, y={top + y} "
-            f"(optical depth {result.optical_depth[y, x]:g}); a smaller density.scale may help"
+            f"(optical depth {tau[y, x].max():g}); a smaller density.scale may help"
         )

@@ -10,7 +10,7 @@ import re
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +21,12 @@ from volcli import images
 from volcli.camera import Camera, make_camera
 from volcli.config import job_as_toml
 from volcli.errors import UsageError
-from volcli.grids import (
-    BrickGrid,
-    GridHeader,
-    Progress,
-    Volume,
-    load_color,
-    load_density,
-    open_volume,
-)
+from volcli.grids import GridHeader, Progress
 from volcli.plan import Plan, make_plan
 from volcli.render import RenderResult, Scene, Window, make_integrator, over, render
+from volcli.scene import Volumes, make_scene, open_volumes, read_grids, scene_box
 from volcli.schema import DEFAULT_FOV, Job
+from volcli.tables import ColorTable, check_maps
 from volcli.transforms import each_camera
 from volcli.warmup import StandIn, WarmUp
 
@@ -47,7 +41,7 @@ there is something to compile), ``rendering``, ``writing``.
 
 @dataclass(frozen=True)
 class Prepared:
-    """A job with its volume opened and its plan made: all that can fail early has not failed.
+    """A job with its volumes opened and its plan made: all that can fail early has not failed.
 
     Attributes
     ----------
@@ -56,7 +50,7 @@ class Prepared:
     """
 
     job: Job
-    volume: Volume
+    volumes: Volumes
     plan: Plan
     files: dict[str, Path]
     background: Any
@@ -68,8 +62,8 @@ class Loaded:
 
     Attributes
     ----------
-    density, color
-        The density, and the colour: a grid or one radiance.
+    scene
+        The grids with what the job makes of their values.
     warnings
         What was changed in the values on the way.
     seconds
@@ -78,8 +72,7 @@ class Loaded:
         What will render them, being made ready; None where nothing is to be rendered.
     """
 
-    density: BrickGrid
-    color: BrickGrid | tuple[float, float, float]
+    scene: Scene
     warnings: tuple[str, ...]
     seconds: float
     kernels: WarmUp | None
@@ -177,14 +170,15 @@ def prepare_each(job: Job, *, overwrite: bool = True, writes: bool = True) -> tu
     for camera in (one.camera for one in jobs):
         if camera.eye is not None and camera.target is not None:
             make_camera(camera, UNKNOWN_BOX)  # raises now what needs no volume to be known
-    volume = open_volume(job.density.file, job.density.reader)
+    check_maps(job)
+    volumes = open_volumes(job)
     layers = {"picture", *job.output.maps}
     if not files[0] or files[0]["picture"].suffix.lower() == ".exr":
         layers |= {"transmittance", "optical_depth", "depth"}
-    plan = make_plan(job, volume, frozenset(layers))
+    plan = make_plan(job, volumes.density, frozenset(layers), volumes.color, volumes.emission)
     behind = {size: _background(job, size) for size in {one.camera.size for one in jobs}}
     return tuple(
-        Prepared(one, volume, plan, of_one, behind[one.camera.size])
+        Prepared(one, volumes, plan, of_one, behind[one.camera.size])
         for one, of_one in zip(jobs, files, strict=True)
     )
 
@@ -215,23 +209,16 @@ def load(
     VolumeError
         A file is damaged, or holds NaN or Inf where the job does not accept them.
     """
-    job, plan, volume = prepared.job, prepared.plan, prepared.volume
 
     def progress(header: GridHeader) -> Progress:
         return lambda done, total: on_stage(f"reading {header.label}", done, total)
 
+    job, plan, volumes = prepared.job, prepared.plan, prepared.volumes
     begin = time.perf_counter()
     kernels = WarmUp(lambda: _use_kernels(prepared)) if prepared.files else None
-    density, warnings = load_density(
-        volume, plan.density, job.density.nonfinite, progress(plan.density), cache
-    )
-    color: BrickGrid | tuple[float, float, float] = job.color.value
-    if plan.color is not None:
-        color, notes = load_color(
-            volume, plan.color, job.density.nonfinite, progress(plan.color), cache
-        )
-        warnings = [*warnings, *(note for note in notes if note not in warnings)]
-    return Loaded(density, color, tuple(warnings), time.perf_counter() - begin, kernels)
+    grids, warnings = read_grids(job, plan, volumes, progress, cache)
+    scene, notes = make_scene(job, plan, volumes, grids)
+    return Loaded(scene, (*warnings, *notes), time.perf_counter() - begin, kernels)
 
 
 def run(
@@ -263,8 +250,8 @@ def render_loaded(
     on_stage: OnStage = lambda stage, done, total: None,
 ) -> Rendered:
     """The first half of `run`: the arrays of a picture, or of a part of it."""
-    plan, density = prepared.plan, loaded.density
-    box = UNKNOWN_BOX if density.is_empty else density.world_box()
+    plan, box = prepared.plan, scene_box(loaded.scene)
+    box = UNKNOWN_BOX if box is None else box
     job = _resolved(prepared.job, make_camera(prepared.job.camera, box))
     # Made anew from what was chosen, so that the job in the header gives the same rays to the bit.
     camera = make_camera(job.camera, box)
@@ -273,7 +260,7 @@ def render_loaded(
         loaded.kernels.wait(lambda done, total: on_stage("compiling", done, total))
     waited = time.perf_counter() - waiting
     result = render(
-        _scene(prepared, loaded),
+        loaded.scene,
         plan,
         camera,
         threads=threads,
@@ -288,16 +275,24 @@ def render_loaded(
     return Rendered(job, result, seconds, (*plan.warnings, *loaded.warnings))
 
 
-def _scene(prepared: Prepared, loaded: Loaded) -> Scene:
-    return Scene(loaded.density, prepared.job.density.scale, loaded.color)
-
-
 def _use_kernels(prepared: Prepared) -> None:
-    """Have no rays integrated through a stand-in for the volume, as the picture's will be."""
-    volume = StandIn(prepared.volume.path, prepared.volume.headers)
-    stand_in = replace(prepared, volume=volume, files={})
+    """Have no rays integrated through a stand-in for the volumes, as the picture's will be."""
+    job, plan = prepared.job, prepared.plan
+    density, color, emission = (
+        StandIn(volume.path, volume.headers)
+        for volume in (
+            prepared.volumes.density,
+            prepared.volumes.color,
+            prepared.volumes.emission,
+        )
+    )
+    volumes = Volumes(density, color, emission)
+    grids, _ = read_grids(job, plan, volumes)
+    # Its values are no temperatures: any table will do.
+    ramp = ColorTable(np.array([0.0, 1.0]), np.zeros((2, 3)))
+    scene, _ = make_scene(job, plan, volumes, grids, table=lambda *_: ramp)
     nothing = np.empty((0, 3))
-    make_integrator(_scene(stand_in, load(stand_in)), prepared.plan)(nothing, nothing)
+    make_integrator(scene, plan)(nothing, nothing)
 
 
 def write(
@@ -373,7 +368,8 @@ def _resolved(job: Job, camera: Camera) -> Job:
     if camera.type == "perspective" and job.camera.focal is None and job.camera.fov is None:
         chosen["fov"] = DEFAULT_FOV
     parts: dict[str, Any] = {"camera": job.camera.model_copy(update=chosen)}
-    for part, name in (("density", "file"), ("background", "image"), ("output", "image")):
+    named = ("density.file", "color.file", "emission.file", "background.image", "output.image")
+    for part, name in (key.split(".") for key in named):
         table = getattr(job, part)
         path = getattr(table, name)
         if path is not None:
@@ -423,11 +419,9 @@ def _write(
             continue
         channels = {c: picture[..., i] for i, c in enumerate("RGBA")}
         assert result.depth is not None, "the plan evaluates depth for an EXR"
-        channels |= {
-            "Z": result.depth,
-            "transmittance.Y": result.transmittance,
-            "optical_depth.Y": result.optical_depth,
-        }
+        channels["Z"] = result.depth
+        channels |= images.layer_channels("transmittance", result.transmittance)
+        channels |= images.layer_channels("optical_depth", result.optical_depth)
         images.write_exr(path, channels, header, overwrite=overwrite)
     on_stage("writing", len(prepared.files), len(prepared.files))
     return maps, warnings

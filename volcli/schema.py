@@ -260,12 +260,13 @@ def field(key: str) -> tuple[str, Any]:
     KeyError
         If there is no such field.
     """
-    model: type[BaseModel] | None = Job
+    model: type[BaseModel] = Job
     *tables, name = key.split(".")
     for table in tables:
-        model = table_of(model, table)
-        if model is None:
+        inner = table_of(model, table)
+        if inner is None:
             raise KeyError(key)
+        model = inner
     info = model.model_fields[name]
     default = None if info.is_required() else info.default
     return info.description or "", default

@@ -18,7 +18,8 @@ from volcli.cli.table import in_bytes, say, table, terminal_width
 from volcli.errors import UsageError
 
 if TYPE_CHECKING:
-    from volcli.plan import Plan
+    from volcli.plan import Plan, Term
+    from volcli.render import Scene
     from volcli.run import Report
 
 
@@ -139,9 +140,7 @@ def render(
     prepared = pictures[0]
     with Bars(quiet) as bars:
         loaded = load(prepared, bars, cache)
-        held = {prepared.plan.density.label: loaded.density.nbytes}
-        if prepared.plan.color is not None and not isinstance(loaded.color, tuple):
-            held[prepared.plan.color.label] = loaded.color.nbytes
+        held = _held(loaded.scene)
         if explain and not as_json:
             say(_explained(prepared.plan, held))
         if not prepared.files:
@@ -180,23 +179,50 @@ def _warn(warnings: Sequence[str]) -> None:
         print(f"volcli: {warning}", file=sys.stderr)
 
 
+def _held(scene: Scene) -> dict[str, int]:
+    """The bytes of the bricks that each term holds; of a grid that two share, the first."""
+    grids: dict[str, Any] = {"optical depth": scene.density}
+    if not isinstance(scene.color, tuple):
+        grids["colour"] = scene.color.grid
+    if scene.emission is not None:
+        grids["emission"] = scene.emission.grid
+    held, seen = {}, set()
+    for term, grid in grids.items():
+        held[term] = 0 if id(grid) in seen else grid.nbytes
+        seen.add(id(grid))
+    return held
+
+
 def _plan(plan: Plan, held: dict[str, int]) -> list[dict[str, Any]]:
     """The terms of a plan with the bytes that their grids hold, as plain data."""
-    return [{**asdict(t), "memory_bytes": held.get(t.grid, 0) if t.grid else 0} for t in plan.terms]
+    return [
+        {**asdict(term), "bytes_held": held.get(term.name, 0) if term.wanted else 0}
+        for term in plan.terms
+    ]
 
 
 def _explained(plan: Plan, held: dict[str, int]) -> str:
+    """The plan as a table. Bytes held are those of the grids as they were loaded."""
     rows = [
         (
-            t.name,
-            "yes" if t.wanted else "no",
-            t.grid or "-",
-            in_bytes(held[t.grid]) if t.grid in held else "-",
-            t.why,
+            term.name,
+            "yes" if term.wanted else "no",
+            term.grid or "-",
+            _read(term),
+            in_bytes(held.get(term.name, 0)) if term.wanted and term.grid else "-",
+            str(term.evaluations or "-"),
+            term.why,
         )
-        for t in plan.terms
+        for term in plan.terms
     ]
-    return table(("term", "in", "grid", "memory", "why"), rows, terminal_width())
+    head = ("term", "in", "grid", "read", "held", "a cell", "why")
+    return table(head, rows, terminal_width())
+
+
+def _read(term: Term) -> str:
+    if not term.wanted or term.grid is None:
+        return "-"
+    return "?" if term.bytes_read is None else in_bytes(term.bytes_read)
 
 
 def _camera_flags(camera: dict[str, Any]) -> str:

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-FORMAT = 1
+FORMAT = 2
 """Goes up with every change of what `build` makes of a tree: bricks kept in a cache then do too."""
 
 BRICK = 8
@@ -89,12 +89,15 @@ class BrickGrid:
     active_box
         (2, 3) int64, index space: the smallest and largest lattice point that is active or differs
         from the background; ``lo > hi`` when there is none.
+    active_range
+        Smallest and largest value of what is active; None where nobody asked.
     """
 
     arrays: BrickArrays
     origin: NDArray[np.int64]
     world_from_index: NDArray[np.float64]
     active_box: NDArray[np.int64]
+    active_range: tuple[float, float] | None = None
 
     @property
     def is_empty(self) -> bool:
@@ -117,10 +120,17 @@ class BrickGrid:
         return np.array([self.arrays.atlas.min(axis=1), self.arrays.atlas.max(axis=1)])
 
     @cached_property
+    def field_range(self) -> tuple[float, float]:
+        """Smallest and largest value of the field, of any channel, the background included."""
+        parts = (self.arrays.atlas, self.arrays.constants)
+        used = [part for part in parts if part.size]
+        return min(float(part.min()) for part in used), max(float(part.max()) for part in used)
+
+    @property
     def brightest(self) -> float:
         """The largest magnitude of any value."""
-        parts = (self.arrays.atlas, self.arrays.constants)
-        return max(float(np.abs(part).max(initial=0.0)) for part in parts)
+        low, high = self.field_range
+        return max(-low, high)
 
     @property
     def local_from_world(self) -> NDArray[np.float64]:

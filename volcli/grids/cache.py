@@ -100,6 +100,7 @@ def _write(entry: Path, grid: BrickGrid, warnings: list[str]) -> None:
         "origin": grid.origin.tolist(),
         "world_from_index": grid.world_from_index.tolist(),
         "active_box": grid.active_box.tolist(),
+        "active_range": grid.active_range,
         "warnings": warnings,
     }
     header = json.dumps(described).encode()
@@ -139,6 +140,7 @@ def _read(entry: Path) -> Loaded:
         np.array(described["origin"], np.int64),
         np.array(described["world_from_index"], np.float64),
         np.array(described["active_box"], np.int64),
+        None if described["active_range"] is None else tuple(described["active_range"]),
     )
     return grid, described["warnings"]
 

@@ -65,7 +65,7 @@ def open_dense(path: Path) -> DenseVolume:
     try:
         if _is_npy(path):
             with path.open("rb") as file:
-                shapes = {"density": _array_header(file)}
+                shapes = {"density": (*_array_header(file), path.stat().st_size)}
             world = np.eye(4)
         else:
             with zipfile.ZipFile(path) as archive:
@@ -74,14 +74,17 @@ def open_dense(path: Path) -> DenseVolume:
                 for name in names:
                     if name not in _PLACEMENT:
                         with archive.open(name + ".npy") as file:
-                            shapes[name] = _array_header(file)
+                            size = archive.getinfo(name + ".npy").compress_size
+                            shapes[name] = (*_array_header(file), size)
                 placed = {name: _load(path, name) for name in _PLACEMENT if name in names}
             world = _placement(path, placed)
     except _DAMAGE as error:
         raise VolumeError(f"{path}: not a readable NumPy file: {_reason(error)}") from error
     if not shapes:
         raise VolumeError(f"{path}: holds no array")
-    return DenseVolume(path, tuple(_header(n, s, d, world) for n, (s, d) in shapes.items()))
+    return DenseVolume(
+        path, tuple(_header(n, *described, world) for n, described in shapes.items())
+    )
 
 
 def tree_from_array(values: NDArray[Any]) -> Tree:
@@ -177,7 +180,11 @@ def _placement(path: Path, placed: dict[str, NDArray[Any]]) -> NDArray[np.float6
 
 
 def _header(
-    name: str, shape: tuple[int, ...], dtype: np.dtype[Any], world: NDArray[np.float64]
+    name: str,
+    shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+    file_bytes: int,
+    world: NDArray[np.float64],
 ) -> GridHeader:
     vector = len(shape) == 4 and shape[3] == 3
     refusal = None
@@ -199,5 +206,6 @@ def _header(
         active_voxels=int(np.prod(shape[:3])),
         active_box=((0, 0, 0), ends) if len(ends) == 3 else None,
         stored="dense",
+        file_bytes=file_bytes,
         refusal=refusal,
     )

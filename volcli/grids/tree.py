@@ -48,6 +48,9 @@ class GridHeader:
         both ends included. None where the file does not say.
     stored
         How the values lie in the file, for people: ``half, blosc + active mask``.
+    file_bytes
+        What the file holds of the grid, from its header to its last leaf; None where only reading
+        it would tell.
     refusal
         Why volcli cannot read this grid ("points grid", ...); None when it can.
     """
@@ -62,6 +65,7 @@ class GridHeader:
     active_voxels: int | None = None
     active_box: tuple[tuple[int, int, int], tuple[int, int, int]] | None = None
     stored: str = ""
+    file_bytes: int | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
     refusal: str | None = None
 

@@ -1,4 +1,4 @@
-"""Values that cannot be rendered as they are: NaN, Inf, and densities below 0."""
+"""Values that cannot be rendered as they are (NaN, Inf, densities below 0), and their range."""
 
 from __future__ import annotations
 
@@ -55,6 +55,21 @@ def clamp_negative(tree: Tree, where: str) -> tuple[Tree, list[str]]:
         return tree, []
     clamped = [np.maximum(p, p.dtype.type(0)) for p in parts]
     return _with_parts(tree, clamped), [f"{where}: {count} values below 0, taken as 0"]
+
+
+def active_range(tree: Tree) -> tuple[float, float]:
+    """Smallest and largest value of active voxels and tiles; of all values where none is active."""
+    low, high = np.inf, -np.inf
+    for start in range(0, len(tree.leaf_values), _CHUNK):
+        values = tree.leaf_values[start : start + _CHUNK]
+        bits = np.unpackbits(tree.leaf_masks[start : start + _CHUNK], axis=1, bitorder="little")
+        active = values.reshape(len(values), -1)[bits.astype(bool)]
+        low, high = active.min(initial=low), active.max(initial=high)
+    tiles = tree.tile_values[tree.tile_active]
+    low, high = tiles.min(initial=low), tiles.max(initial=high)
+    if not low <= high:
+        low, high = np.min(tree.background), np.max(tree.background)
+    return float(low), float(high)
 
 
 def _count(parts: list[NDArray[Any]], test: Callable[[NDArray[Any]], NDArray[np.bool_]]) -> int:

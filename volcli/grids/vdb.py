@@ -213,6 +213,7 @@ class VdbFile:
 
     def _read_grid_header(self, cursor: Cursor, descriptor: _Descriptor) -> _Grid:
         """Read up to the table of the root, where ``cursor`` is left if the tree can be walked."""
+        begin = cursor.at
         compression = self._file_compression
         if self.version >= HAS_BLOCK_MODE:
             word = cursor.uint32("the compression of a grid")
@@ -242,6 +243,7 @@ class VdbFile:
             active_voxels=declared_count(metadata),
             active_box=declared_box(metadata),
             stored=_describe_storage(compression, half),
+            file_bytes=descriptor.end - begin if self._has_offsets else None,
             metadata=metadata,
             refusal=type_refusal or refusal,
         )
@@ -419,6 +421,7 @@ def _resolve_instances(grids: list[_Grid]) -> list[_Grid]:
                     value_type=parent.header.value_type,
                     background=parent.header.background,
                     stored=parent.header.stored,
+                    file_bytes=parent.header.file_bytes,
                 )
                 grid = replace(grid, header=shared, codec=parent.codec, root_at=parent.root_at)
         resolved.append(grid)

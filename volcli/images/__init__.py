@@ -21,12 +21,13 @@ from volcli.images.background import read_background
 from volcli.images.channels import Channels, read_channels
 from volcli.images.paths import check_output
 from volcli.images.read import read_exr
-from volcli.images.write import write_exr, write_map, write_png
+from volcli.images.write import layer_channels, write_exr, write_map, write_png
 from volcli.srgb import linear_from_srgb, srgb_from_linear
 
 __all__ = [
     "Channels",
     "check_output",
+    "layer_channels",
     "linear_from_srgb",
     "read_background",
     "read_channels",

@@ -147,13 +147,15 @@ def write_map(
 ) -> tuple[float, float]:
     """Write one map: EXR as float32 in channel ``Y``, PNG as linear grey of 16 bits.
 
+    A map of three channels, of a medium that filters colour, is ``R``, ``G`` and ``B`` in both.
+
     EXR, and PNG of a map in `UNIT_MAPS`, hold the values themselves. PNG of any other map is
     scaled over its finite range, and +Inf (a depth where nothing was hit) is white.
 
     Parameters
     ----------
     values
-        (height, width), any real dtype and memory order.
+        (height, width) or (height, width, 3), any real dtype and memory order.
     name
         ``"transmittance"``, ``"opacity"``, ``"optical_depth"``, ``"depth"``, ...; stored as
         ``volcli:map``.
@@ -178,29 +180,47 @@ def write_map(
     path = Path(path)
     attributes = {**attributes, "volcli:map": name}
     if path.suffix.lower() != ".png":
-        write_exr(path, {"Y": values}, attributes, overwrite=overwrite)
+        write_exr(path, layer_channels("", values), attributes, overwrite=overwrite)
         return 0.0, 1.0
 
     path = checked_path(path, ".png", overwrite)
     pixels = as_float32(values)
-    if pixels.ndim != 2 or 0 in pixels.shape:
-        raise ValueError(f"{path}: a map must be (height, width), not {pixels.shape}")
+    if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (3,)) or 0 in pixels.shape:
+        raise ValueError(f"{path}: a map must be (height, width[, 3]), not {pixels.shape}")
     if name in UNIT_MAPS:
-        _refuse(path, ~np.isfinite(pixels), "NaN or infinite")
+        _refuse(path, _any_of(~np.isfinite(pixels)), "NaN or infinite")
         low, high = float(pixels.min()), float(pixels.max())
         if low < -CLIP_TOLERANCE or high > 1 + CLIP_TOLERANCE:
             raise ValueError(f"{path}: {name} must lie in [0, 1], not in [{low:g}, {high:g}]")
         lo, hi, unit = 0.0, 1.0, np.clip(pixels, 0, 1)
     else:
-        _refuse(path, np.isnan(pixels) | np.isneginf(pixels), "NaN or -infinite")
+        _refuse(path, _any_of(np.isnan(pixels) | np.isneginf(pixels)), "NaN or -infinite")
         lo, hi, unit = scaled(pixels)
     header = header_of(
         {**attributes, "volcli:map_lo": lo, "volcli:map_hi": hi},
         as_text=True,
     )
-    codes = quantised(unit, np.dtype(np.uint16))[..., np.newaxis]
-    write_whole(path, "png", ["Y"], codes, header, overwrite=overwrite)
+    codes = quantised(unit, np.dtype(np.uint16))
+    names = ["R", "G", "B"] if codes.ndim == 3 else ["Y"]
+    codes = codes.reshape(*pixels.shape[:2], len(names))
+    write_whole(path, "png", names, codes, header, overwrite=overwrite)
     return lo, hi
+
+
+def layer_channels(layer: str, values: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """The channels of an EXR's layer: ``layer.Y`` of (h, w), ``layer.R`` ... of (h, w, 3).
+
+    Without a name of the layer they are ``Y``, or ``R`` ...
+    """
+    prefix = f"{layer}." if layer else ""
+    if np.ndim(values) == 2:
+        return {f"{prefix}Y": values}
+    return {f"{prefix}{c}": values[..., i] for i, c in enumerate("RGB")}
+
+
+def _any_of(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(h, w): where a mask (h, w[, channels]) is set."""
+    return any_channel(mask) if mask.ndim == 3 else mask
 
 
 def _channel_rank(name: str) -> tuple[int, str]:
@@ -210,20 +230,32 @@ def _channel_rank(name: str) -> tuple[int, str]:
 
 
 def _png_losses(path: Path, pixels: NDArray[np.float32], alpha: NDArray[np.float32]) -> list[str]:
-    """What PNG could not hold of (h, w, 4) premultiplied pixels, one line for each kind."""
+    """What PNG could not hold of (h, w, 4) premultiplied pixels, one line for each kind.
+
+    Of light it says how much, as a part of all the light in the picture.
+    """
     rgb = pixels[..., :3]
     transparent = alpha[..., 0] == 0
     # Measured before division by alpha, where rounding at low opacity is not magnified.
     above = any_channel(rgb > alpha + CLIP_TOLERANCE) & ~transparent
     above |= pixels[..., 3] > 1 + CLIP_TOLERANCE
-    below = any_channel(pixels < -CLIP_TOLERANCE)
+    beyond = np.maximum(rgb - alpha, 0).sum(axis=-1, dtype=np.float64)
+    light = np.maximum(rgb, 0).sum(dtype=np.float64)
+
+    def part(mask: NDArray[np.bool_]) -> str:
+        lost = beyond[mask].sum() / light if light > 0 else 0.0
+        return "less than 0.1 %" if lost < 1e-3 else f"{100 * lost:.3g} %"
+
     lost = {
-        "hold light where opacity is 0, which PNG cannot store": transparent & any_channel(rgb > 0),
-        "are brighter than 1 and were clipped": above,
-        "are negative and were clipped": below,
+        "hold light where opacity is 0, which PNG cannot store ({} of the picture's light)": (
+            transparent & any_channel(rgb > 0)
+        ),
+        "are brighter than 1 and were clipped ({} of the picture's light)": above,
+        "are negative and were clipped": any_channel(pixels < -CLIP_TOLERANCE),
     }
     return [
-        f"{path}: {np.count_nonzero(mask)} of {mask.size} pixels {what}; write .exr to keep them"
+        f"{path}: {np.count_nonzero(mask)} of {mask.size} pixels "
+        f"{what.format(part(mask)) if '{}' in what else what}; write .exr to keep them"
         for what, mask in lost.items()
         if mask.any()
     ]
