@@ -118,7 +118,7 @@ def inspect(
     if html is not None:
         from volcli.opacity.page import write_page
 
-        write_page(html, kept, overwrite=overwrite)
+        write_page(html, kept, colormap=colormap, overwrite=overwrite)
     if as_json:
         say(json.dumps(printed[0] if len(images) == 1 else {"images": printed}, allow_nan=False))
     else:

@@ -119,8 +119,8 @@ function shareOf(value, name) {
 
 // -- drawing ------------------------------------------------------------------------------------
 
-const opaque = (r, g, b) => (0xff000000 | (b << 16) | (g << 8) | r) >>> 0;
-const GREY = opaque(128, 128, 128), DIM = opaque(64, 64, 64);
+function opaque(r, g, b) { return (0xff000000 | (b << 16) | (g << 8) | r) >>> 0; }
+const GREY = opaque(128, 128, 128);
 
 function lookup() {
   const bytes = bytesOf(data.colormaps[state.colormap]), table = new Uint32Array(256);
@@ -128,41 +128,44 @@ function lookup() {
   return table;
 }
 
-// A function from a pixel's number, and where it is on the screen, to its colour.
-function shader(image) {
-  if (state.layer === "picture") return pictureShader(image);
+// A function that paints a part of a row: pixel row + columns[x] at x, from x0 up to x1, into out.
+function painter(image) {
+  if (state.layer === "picture") return picturePainter(image);
   const values = plane(image, state.layer), table = lookup();
-  if (!values) return () => GREY;
+  if (!values) return (out, at, row, columns, x0, x1) => out.fill(GREY, at + x0, at + x1);
   let low = valueAt(state.low, state.layer), high = valueAt(state.high, state.layer);
-  const log = state.log;
+  const log = Boolean(state.log);
   if (log) [low, high] = [Math.log(low), Math.log(high)];
   const scale = 255.999 / Math.max(high - low, 1e-30);
-  return (i) => {
-    const v = log ? Math.log(values[i]) : values[i];
-    if (!(v < Infinity) || v === -Infinity) return GREY; // NaN, no hit, 0 on a logarithmic scale
-    const at = (v - low) * scale;
-    return table[at <= 0 ? 0 : at >= 255 ? 255 : at | 0];
+  return (out, at, row, columns, x0, x1) => {
+    for (let x = x0; x < x1; x++) {
+      const value = values[row + columns[x]], v = log ? Math.log(value) : value;
+      const shade = (v - low) * scale;
+      // Grey: NaN, no hit, 0 on a logarithmic scale.
+      out[at + x] = !(v < Infinity && v > -Infinity) ? GREY
+        : table[shade <= 0 ? 0 : shade >= 255 ? 255 : shade | 0];
+    }
   };
 }
 
-function pictureShader(image) {
-  const { red, green, blue, transmittance: T } = image.planes;
+function shown(v) { return SRGB[v <= 0 ? 0 : v >= 1 ? 4096 : (v * 4096 + 0.5) | 0]; }
+
+function picturePainter(image) {
+  const { red, green, blue, transmittance } = image.planes;
   const code = state.background === "custom" ? state.colour : state.background;
   const checks = state.background === "checks";
-  const behind = [0, 2, 4].map((at) => linear(parseInt(code.slice(at, at + 2), 16)));
+  const [r, g, b] = [0, 2, 4].map((at) => linear(parseInt(code.slice(at, at + 2), 16)));
   const dark = linear(110), light = linear(150);
-  const shown = (v) => SRGB[v <= 0 ? 0 : v >= 1 ? 4096 : (v * 4096 + 0.5) | 0];
-  return (i, x, y) => {
-    let [r, g, b] = behind;
-    if (checks) r = g = b = ((x >> 4) ^ (y >> 4)) & 1 ? light : dark;
-    const t = T[i];
-    r *= t; g *= t; b *= t;
-    if (red) { r += HALF[red[i]]; g += HALF[green[i]]; b += HALF[blue[i]]; }
-    return opaque(shown(r), shown(g), shown(b));
+  return (out, at, row, columns, x0, x1, y) => {
+    for (let x = x0; x < x1; x++) {
+      const i = row + columns[x], T = transmittance[i];
+      const board = ((x >> 4) ^ (y >> 4)) & 1 ? light : dark;
+      let R = T * (checks ? board : r), G = T * (checks ? board : g), B = T * (checks ? board : b);
+      if (red !== undefined) { R += HALF[red[i]]; G += HALF[green[i]]; B += HALF[blue[i]]; }
+      out[at + x] = opaque(shown(R), shown(G), shown(B));
+    }
   };
 }
-
-const dim = (c) => (0xff000000 | (((c & 0xfcfcfc) >> 2) + 0x303030)) >>> 0;
 
 function fitZoom() { return Math.min(canvas.width / width, canvas.height / height); }
 function zoom() { return state.zoom === null ? fitZoom() : state.zoom * devicePixelRatio; }
@@ -182,48 +185,75 @@ function draw() {
   const W = canvas.width, H = canvas.height, frame = context.createImageData(W, H);
   const out = new Uint32Array(frame.data.buffer);
   const columns = sources(W, width, state.x), rows = sources(H, height, state.y);
-  const split = data.images.length > 1 ? Math.round(state.wipe * W) : W;
-  const sides = [left(), right()].map((image) => ({
-    paint: shader(image), values: plane(image, measured()), tau: image.planes.optical_depth,
-  }));
-  const brushed = state.from !== null, { from, to } = state;
-  const threshold = state.line ? -Math.log1p(-state.iso) : null;
   const outside = getComputedStyle($("stage")).backgroundColor.match(/\d+/g).map(Number);
-  const beyond = opaque(...outside);
-  let above = new Uint8Array(W), here = new Uint8Array(W); // 1: below the line, 2: above it
-  for (let y = 0, at = 0; y < H; y++) {
-    const row = rows[y] * width;
-    for (let x = 0; x < W; x++, at++) {
-      if (row < 0 || columns[x] < 0) { out[at] = beyond; here[x] = 0; continue; }
-      const i = row + columns[x], side = sides[x < split ? 0 : 1];
-      let colour = side.paint(i, x, y);
-      if (brushed && !(side.values && side.values[i] >= from && side.values[i] <= to)) {
-        colour = dim(colour);
-      }
-      if (threshold !== null) {
-        const now = here[x] = side.tau[i] >= threshold ? 2 : 1;
-        if (now + above[x] === 3 || (x && x !== split && now + here[x - 1] === 3)) {
-          const green = (colour >> 8) & 255;
-          colour = green > 110 ? opaque(0, 0, 0) : opaque(255, 255, 255);
-        }
-      }
-      out[at] = colour;
+  out.fill(opaque(...outside));
+  const first = columns.findIndex((c) => c >= 0), last = columns.findLastIndex((c) => c >= 0) + 1;
+  const split = data.images.length > 1 ? Math.round(state.wipe * W) : W;
+  const sides = first < 0 ? [] : [
+    [left(), first, Math.min(last, split)], [right(), Math.max(first, split), last],
+  ];
+  for (const [image, x0, x1] of sides) {
+    if (x0 >= x1) continue;
+    const paint = painter(image);
+    for (let y = 0; y < H; y++) {
+      if (rows[y] >= 0) paint(out, y * W, rows[y] * width, columns, x0, x1, y);
     }
-    [above, here] = [here, above];
+    if (state.from !== null) dimOthers(image, out, W, rows, columns, x0, x1);
+    if (state.line) drawLine(image, out, W, rows, columns, x0, x1);
   }
   if (data.images.length > 1) {
-    for (let y = 0, x = Math.min(split, W - 1); y < H; y++) out[y * W + x] = opaque(255, 255, 255);
+    const x = Math.max(1, Math.min(split, W - 1));
+    for (let y = 0; y < H; y++) {
+      out[y * W + x - 1] = opaque(0, 0, 0);
+      out[y * W + x] = opaque(255, 255, 255);
+    }
   }
   context.putImageData(frame, 0, 0);
   placeCross();
   canvas.dataset.drawMs = (performance.now() - begin).toFixed(1);
 }
 
+// Darken what is not highlighted.
+function dimOthers(image, out, W, rows, columns, x0, x1) {
+  const values = plane(image, measured()), { from, to } = state;
+  for (let y = 0; y < rows.length; y++) {
+    if (rows[y] < 0) continue;
+    for (let x = x0, at = y * W + x0, row = rows[y] * width; x < x1; x++, at++) {
+      const v = values === null ? NaN : values[row + columns[x]];
+      if (!(v >= from && v <= to)) out[at] = (0xff000000 | (((out[at] & 0xfcfcfc) >> 2) + 0x303030)) >>> 0;
+    }
+  }
+}
+
+// Where opacity crosses the chosen one between a pixel of the canvas and that above or to the left.
+function drawLine(image, out, W, rows, columns, x0, x1) {
+  const tau = image.planes.optical_depth, threshold = -Math.log1p(-state.iso);
+  let above = new Uint8Array(W).fill(2), here = new Uint8Array(W); // 0 or 1; 2: there is no row
+  for (let y = 0; y < rows.length; y++) {
+    if (rows[y] < 0) continue;
+    for (let x = x0, at = y * W + x0, row = rows[y] * width; x < x1; x++, at++) {
+      const over = here[x] = tau[row + columns[x]] >= threshold ? 1 : 0;
+      if (above[x] + over === 1 || (x > x0 && here[x - 1] !== over)) {
+        out[at] = ((out[at] >> 8) & 255) > 110 ? opaque(0, 0, 0) : opaque(255, 255, 255);
+      }
+    }
+    [above, here] = [here, above];
+  }
+}
+
 let waiting = false;
-function redraw() {
+function refresh() { // once a frame, however often the state changes
   if (waiting) return;
   waiting = true;
-  requestAnimationFrame(() => { waiting = false; draw(); });
+  requestAnimationFrame(() => {
+    waiting = false;
+    showState();
+    drawHistogram();
+    drawBrushed();
+    drawValues();
+    draw();
+    keep();
+  });
 }
 
 // -- histogram and colour bar -------------------------------------------------------------------
@@ -294,7 +324,12 @@ function drawBrushed() {
       $(id).value = state[id] === null ? "" : Number(state[id].toPrecision(6));
     }
   }
-  if (state.from === null) { $("brushed").textContent = ""; return; }
+  if (state.from === null) {
+    $("brushed").textContent = $("brushed").dataset.key = "";
+    return;
+  }
+  const key = [name, state.left, state.from, state.to].join();
+  if ($("brushed").dataset.key === key) return;
   const values = plane(left(), name);
   let n = 0;
   for (let i = 0; values && i < values.length; i++) {
@@ -302,6 +337,7 @@ function drawBrushed() {
   }
   const share = ((100 * n) / (width * height)).toPrecision(3);
   $("brushed").textContent = `${n.toLocaleString("en")} pixels, ${share} %`;
+  $("brushed").dataset.key = key;
 }
 
 // -- values under the cursor --------------------------------------------------------------------
@@ -310,7 +346,8 @@ const titleOf = (name) => LAYERS.find(([n]) => n === name)[1];
 function show(v) {
   if (v === null || v === undefined) return "-";
   if (!Number.isFinite(v)) return Number.isNaN(v) ? "NaN" : v > 0 ? "infinite" : "-infinite";
-  return String(Number(v.toPrecision(6)));
+  const small = v !== 0 && Math.abs(v) < 1e-3;
+  return small ? v.toExponential(5).replace(/\.?0*e/, "e") : String(Number(v.toPrecision(6)));
 }
 
 function drawValues() {
@@ -374,7 +411,7 @@ function update(changes) {
   refresh();
 }
 
-function refresh() {
+function showState() {
   for (const [name] of LAYERS) {
     const button = $(`layer-${name}`);
     if (button) button.checked = state.layer === name;
@@ -386,6 +423,7 @@ function refresh() {
   $("log").checked = Boolean(state.log);
   $("line").checked = Boolean(state.line);
   $("behind").disabled = state.layer !== "picture";
+  $("scale").disabled = state.layer === "picture";
   $("low-value").textContent = show(valueAt(state.low, measured()));
   $("high-value").textContent = show(valueAt(state.high, measured()));
   $("iso-value").textContent = Number(state.iso).toFixed(3);
@@ -393,11 +431,6 @@ function refresh() {
   $("about").textContent = two ? `${left().about}  |  ${right().about}` : left().about;
   const dark = state.theme || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
   document.documentElement.dataset.theme = dark;
-  drawHistogram();
-  drawBrushed();
-  drawValues();
-  redraw();
-  keep();
 }
 
 // The link holds what differs from the start, such as #layer=opacity&zoom=4.
@@ -583,8 +616,7 @@ async function begin() {
   listen();
   new ResizeObserver(() => {
     sized(canvas);
-    drawHistogram();
-    redraw();
+    refresh();
   }).observe($("stage"));
   sized(canvas);
   refresh();
