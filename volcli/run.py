@@ -22,6 +22,7 @@ from volcli.camera import Camera, make_camera
 from volcli.config import job_as_toml
 from volcli.errors import UsageError
 from volcli.grids import GridHeader, Progress
+from volcli.grids.threads import threads_limited_to
 from volcli.plan import Plan, make_plan
 from volcli.render import RenderResult, Scene, Window, make_integrator, over, render
 from volcli.scene import Volumes, make_scene, open_volumes, read_grids, scene_box
@@ -196,6 +197,7 @@ def load(
     prepared: Prepared,
     on_stage: OnStage = lambda stage, done, total: None,
     cache: Path | None = None,
+    threads: int | None = None,
 ) -> Loaded:
     """Read the grids that the plan names, and meanwhile begin to make the kernels ready.
 
@@ -203,6 +205,8 @@ def load(
     ----------
     cache
         A folder that keeps bricks from one load to the next.
+    threads
+        Default: the processors that this process may use.
 
     Raises
     ------
@@ -216,7 +220,8 @@ def load(
     job, plan, volumes = prepared.job, prepared.plan, prepared.volumes
     begin = time.perf_counter()
     kernels = WarmUp(lambda: _use_kernels(prepared)) if prepared.files else None
-    grids, warnings = read_grids(job, plan, volumes, progress, cache)
+    with threads_limited_to(threads):
+        grids, warnings = read_grids(job, plan, volumes, progress, cache)
     scene, notes = make_scene(job, plan, volumes, grids)
     return Loaded(scene, (*warnings, *notes), time.perf_counter() - begin, kernels)
 

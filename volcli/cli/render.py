@@ -139,7 +139,7 @@ def render(
     pictures = prepare_each(job, overwrite=overwrite, writes=not explain)
     prepared = pictures[0]
     with Bars(quiet) as bars:
-        loaded = load(prepared, bars, cache)
+        loaded = load(prepared, bars, cache, threads)
         held = _held(loaded.scene)
         if explain and not as_json:
             say(_explained(prepared.plan, held))
