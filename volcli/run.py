@@ -21,7 +21,7 @@ from volcli import images
 from volcli.camera import Camera, make_camera
 from volcli.config import job_as_toml
 from volcli.errors import UsageError
-from volcli.grids import GridHeader, Progress
+from volcli.grids import Cache, GridHeader, Progress
 from volcli.grids.threads import threads_limited_to
 from volcli.plan import Plan, make_plan
 from volcli.render import RenderResult, Scene, Window, make_integrator, over, render
@@ -196,7 +196,7 @@ def _background(job: Job, size: tuple[int, int]) -> Any:
 def load(
     prepared: Prepared,
     on_stage: OnStage = lambda stage, done, total: None,
-    cache: Path | None = None,
+    cache: Cache | None = None,
     threads: int | None = None,
 ) -> Loaded:
     """Read the grids that the plan names, and meanwhile begin to make the kernels ready.
@@ -204,7 +204,7 @@ def load(
     Parameters
     ----------
     cache
-        A folder that keeps bricks from one load to the next.
+        What keeps bricks from one load to the next.
     threads
         Default: the processors that this process may use.
 

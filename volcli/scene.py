@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from volcli.grids import (
     BrickGrid,
+    Cache,
     GridHeader,
     Progress,
     Volume,
@@ -77,7 +78,7 @@ def read_grids(
     plan: Plan,
     volumes: Volumes,
     progress: Callable[[GridHeader], Progress] = lambda header: lambda done, total: None,
-    cache: Path | None = None,
+    cache: Cache | None = None,
 ) -> tuple[Grids, list[str]]:
     """Read the grids that a plan names, with warnings on what was changed in their values.
 
@@ -88,7 +89,7 @@ def read_grids(
     progress
         Gives what is called while a grid is read.
     cache
-        A folder that keeps bricks from one load to the next.
+        What keeps bricks from one load to the next.
 
     Raises
     ------

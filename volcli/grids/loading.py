@@ -22,13 +22,21 @@ from volcli.grids.values import active_range, clamp_negative, settle_nonfinite
 Transfer = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Densities of values, where a job has a transfer function: values below 0 are then kept."""
 
+Reading = Callable[[], tuple[BrickGrid, list[str]]]
+"""Reads a grid: its bricks, and what the user should know of them."""
+
+Cache = Path | Callable[[Path, str, tuple[str, ...], Reading], tuple[BrickGrid, list[str]]]
+"""Keeps bricks from one load to the next: a folder (`grids.cache`), or what is called as
+``cache(file, label, settings, read)`` and may keep them elsewhere.
+"""
+
 
 def load_density(
     volume: Volume,
     header: GridHeader,
     nonfinite: str,
     progress: Progress | None = None,
-    cache: Path | None = None,
+    cache: Cache | None = None,
     *,
     level_set: bool = False,
     transfer: Transfer | None = None,
@@ -42,7 +50,7 @@ def load_density(
     nonfinite
         What NaN and Inf are: ``error``, or ``zero``.
     cache
-        A folder that keeps bricks from one load to the next.
+        What keeps bricks from one load to the next.
     level_set
         Whether the grid is a level set, to be taken as fog.
     transfer
@@ -74,7 +82,7 @@ def load_source(
     header: GridHeader,
     nonfinite: str,
     progress: Progress | None = None,
-    cache: Path | None = None,
+    cache: Cache | None = None,
 ) -> tuple[BrickGrid, list[str]]:
     """Read a grid as a source of light, scalar or Vec3, with its values as they are.
 
@@ -129,19 +137,21 @@ def empty_grid(header: GridHeader) -> BrickGrid:
 
 
 def _cached(
-    read: Callable[[], tuple[BrickGrid, list[str]]],
+    read: Reading,
     volume: Volume,
     header: GridHeader,
     form: str,
     nonfinite: str,
-    cache: Path | None,
+    cache: Cache | None,
 ) -> tuple[BrickGrid, list[str]]:
     """A grid by way of the cache, if there is one; ``form`` is what was made of its values."""
     if cache is None:
         return read()
+    settings = (type(volume).__name__, form, nonfinite)
+    if not isinstance(cache, Path):
+        return cache(volume.path, header.label, settings, read)
     from volcli.grids.cache import through_cache
 
-    settings = (type(volume).__name__, form, nonfinite)
     return through_cache(cache, volume.path, header.label, settings, read)
 
 
