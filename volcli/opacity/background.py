@@ -36,7 +36,7 @@ def radiance_of(maps: Maps) -> Floats | None:
     behind = _rendered_background(maps)
     if behind is None:
         return colour
-    return colour - maps.transmittance[..., None] * behind[..., :3]
+    return colour - _channels(maps.through) * behind[..., :3]
 
 
 def recomposite(maps: Maps, background: NDArray[np.float32] | None) -> Floats:
@@ -62,9 +62,16 @@ def recomposite(maps: Maps, background: NDArray[np.float32] | None) -> Floats:
     if radiance is None:
         raise UsageError(f"{maps.stored.path}: has no channels R, G and B to put before another")
     picture = np.dstack([radiance, maps.opacity])
-    if background is None:
-        return picture
-    return picture + maps.transmittance[..., None] * np.asarray(background, np.float32)
+    if background is not None:
+        behind = np.asarray(background, np.float32)
+        picture[..., :3] += _channels(maps.through) * behind[..., :3]
+        picture[..., 3] += maps.transmittance * behind[..., 3]
+    return picture
+
+
+def _channels(through: Floats) -> Floats:
+    """(h, w, 1) or (h, w, 3)."""
+    return through[..., None] if through.ndim == 2 else through
 
 
 def _rendered_background(maps: Maps) -> Floats | None:

@@ -47,7 +47,9 @@ def picture_pixels(maps: Maps, size: tuple[int, int]) -> NDArray[np.uint8] | Non
     if radiance is None:
         return None
     light = np.stack([averaged(radiance[..., c], size) for c in range(3)], axis=-1)
-    through = averaged(maps.transmittance, size)[..., None]
+    through = np.stack(
+        [averaged(t, size) for t in np.moveaxis(np.atleast_3d(maps.through), -1, 0)], axis=-1
+    )
     rows, columns = np.indices(size)
     board = _CHECKS[(rows // 4 + columns // 4) % 2][..., None]
     linear = light + through * ((board + 0.055) / 1.055) ** 2.4

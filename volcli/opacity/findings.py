@@ -161,7 +161,11 @@ def _storage(numbers: dict[str, Any]) -> list[tuple[str, str]]:
     for layer, difference in numbers["disagreement"].items():
         if difference > 1e-5:
             found.append(
-                ("disagreement", f"{layer} differs from the optical depth by {difference:.3g}")
+                (
+                    "disagreement",
+                    f"{layer} and what the layers say of opacity differ by {difference:.3g}: the "
+                    f"file was changed after it was rendered",
+                )
             )
     return found
 

@@ -2,6 +2,9 @@
 
 An EXR of volcli holds optical depth and transmittance as layers, which no background touches; any
 other image has at most alpha, of which the rest follows. What is derived is said in ``source``.
+
+Of a pixel with several samples each layer is a mean of its own, so that T is not exp(-tau) of the
+other. Under a tint each layer has three channels; the maps are the means over them.
 """
 
 from __future__ import annotations
@@ -23,6 +26,9 @@ Floats = NDArray[np.float32]
 MAP_HEADER = "volcli:map"
 """The header entry that names the map in a file that holds nothing else."""
 
+SAME = 1e-6
+"""A difference of opacity that is rounding."""
+
 NO_ALPHA = "no alpha: opaque"
 """The source of opacity of an image that says nothing of it."""
 
@@ -39,6 +45,8 @@ class Maps:
         (h, w) float32. Optical depth is +Inf where opacity is 1 and nothing tells more.
     depth
         (h, w) float32, or None: distance along the camera's axis, +Inf where nothing is hit.
+    through
+        (h, w) or, under a tint, (h, w, 3): what the background is multiplied by.
     source
         Map -> where its values come from, for people: ``layer transmittance.Y``.
     """
@@ -48,6 +56,7 @@ class Maps:
     transmittance: Floats
     optical_depth: Floats
     depth: Floats | None
+    through: Floats
     source: dict[str, str]
 
     @property
@@ -76,6 +85,13 @@ class Maps:
         return None if rule is None else str(rule)
 
     @property
+    def is_mean(self) -> bool:
+        """Whether a pixel is a mean, over samples or over the channels of a tint: then optical
+        depth and transmittance are not each other's exponential."""
+        samples = self.job.get("camera", {}).get("samples", 1)
+        return self.through.ndim == 3 or samples != 1
+
+    @property
     def density_scale(self) -> float | None:
         """The density scale that the image was rendered with, if it says so."""
         scale = self.job.get("density", {}).get("scale")
@@ -94,15 +110,18 @@ def read_maps(path: str | os.PathLike[str]) -> Maps:
     if MAP_HEADER in stored.attributes:
         return _of_one_map(stored, str(stored.attributes[MAP_HEADER]))
     alpha = stored.find("A", "alpha", *(n for n in stored.planes if n.lower().endswith(".a")))
-    tau = stored.find("optical_depth.Y")
-    transmittance = stored.find("transmittance.Y")
+    tau, transmittance = (_layer(stored, name) for name in ("optical_depth", "transmittance"))
+    covered = alpha is None or bool((alpha >= 1).all())
     source: dict[str, str] = {}
-    if tau is not None:
-        opacity, source["opacity"] = _opacity_of(tau), "1 - exp(-optical_depth.Y)"
-    elif transmittance is not None:
-        opacity, source["opacity"] = 1 - transmittance, "1 - transmittance.Y"
-    elif alpha is not None:
+    if alpha is not None and not (covered and (tau is not None or transmittance is not None)):
         opacity, source["opacity"] = alpha, "alpha"
+    elif transmittance is not None:  # alpha is that of the background
+        opacity, source["opacity"] = 1 - _mean(transmittance), "1 - transmittance"
+        exact = None if tau is None else _opacity_of(_mean(tau))
+        if exact is not None and float(np.abs(exact - opacity).max(initial=0)) < SAME:
+            opacity, source["opacity"] = exact, "1 - exp(-optical depth)"
+    elif tau is not None:
+        opacity, source["opacity"] = _opacity_of(_mean(tau)), "1 - exp(-optical depth)"
     elif stored.file_format == "png" and stored.find("R") is not None:
         # volcli leaves alpha out of a PNG whose every pixel is opaque.
         opacity = np.ones(stored.size[::-1], np.float32)
@@ -113,6 +132,22 @@ def read_maps(path: str | os.PathLike[str]) -> Maps:
             f"{', '.join(stored.planes)}; render an .exr, or an image with alpha"
         )
     return _completed(stored, opacity, transmittance, tau, stored.find("Z"), source)
+
+
+def _layer(stored: Channels, name: str) -> Floats | None:
+    """A layer of volcli's: (h, w), or (h, w, 3) under a tint; None where there is none."""
+    plain = stored.find(f"{name}.Y")
+    if plain is not None:
+        return plain
+    channels = [stored.find(f"{name}.{c}") for c in "RGB"]
+    if any(c is None for c in channels):
+        return None
+    return np.stack(channels, axis=-1)  # type: ignore[arg-type]
+
+
+def _mean(layer: Floats) -> Floats:
+    """(h, w): the mean over channels where there are three."""
+    return layer if layer.ndim == 2 else layer.mean(axis=-1, dtype=np.float64).astype(np.float32)
 
 
 def _completed(
@@ -127,21 +162,21 @@ def _completed(
     if transmittance is None:
         transmittance, source["transmittance"] = 1 - opacity, "1 - opacity"
     else:
-        source["transmittance"] = "layer transmittance.Y"
+        source["transmittance"] = "layer transmittance"
     if tau is None:
         tau, source["optical_depth"] = _depth_of(opacity), "-log(1 - opacity)"
     else:
-        source["optical_depth"] = "layer optical_depth.Y"
+        source["optical_depth"] = "layer optical_depth"
     if depth is not None:
         source["depth"] = "channel Z"
-    return Maps(stored, opacity, transmittance, tau, depth, source)
+    return Maps(stored, opacity, _mean(transmittance), _mean(tau), depth, transmittance, source)
 
 
 def _of_one_map(stored: Channels, name: str) -> Maps:
     """The maps that one map of volcli's tells; a PNG's values are scaled back."""
     low = float(stored.attributes.get("volcli:map_lo", 0.0))
     high = float(stored.attributes.get("volcli:map_hi", 1.0))
-    (values,) = stored.planes.values()
+    values = _mean(np.stack(list(stored.planes.values()), axis=-1))
     if (low, high) != (0.0, 1.0):
         values = (low + values * np.float64(high - low)).astype(np.float32)
     if name == "opacity":

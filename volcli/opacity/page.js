@@ -57,9 +57,10 @@ const linear = (code) => {
 
 async function load(image) {
   for (const [name, text] of Object.entries(image.planes)) {
-    const size = name === "optical_depth" || name === "depth" ? 4 : 2;
+    const size = ["red", "green", "blue"].includes(name) ? 2 : 4;
     image.planes[name] = await unpack(text, size);
   }
+  if (image.planes.transmittance) return;
   const tau = image.planes.optical_depth;
   const transmittance = image.planes.transmittance = new Float32Array(tau.length);
   for (let i = 0; i < tau.length; i++) transmittance[i] = Math.exp(-tau[i]);
@@ -152,15 +153,17 @@ function shown(v) { return SRGB[v <= 0 ? 0 : v >= 1 ? 4096 : (v * 4096 + 0.5) | 
 
 function picturePainter(image) {
   const { red, green, blue, transmittance } = image.planes;
+  const throughs = ["red", "green", "blue"].map((c) => image.planes[`through_${c}`] || transmittance);
+  const [throughRed, throughGreen, throughBlue] = throughs;
   const code = state.background === "custom" ? state.colour : state.background;
   const checks = state.background === "checks";
   const [r, g, b] = [0, 2, 4].map((at) => linear(parseInt(code.slice(at, at + 2), 16)));
   const dark = linear(110), light = linear(150);
   return (out, at, row, columns, x0, x1, y) => {
     for (let x = x0; x < x1; x++) {
-      const i = row + columns[x], T = transmittance[i];
-      const board = ((x >> 4) ^ (y >> 4)) & 1 ? light : dark;
-      let R = T * (checks ? board : r), G = T * (checks ? board : g), B = T * (checks ? board : b);
+      const i = row + columns[x], board = ((x >> 4) ^ (y >> 4)) & 1 ? light : dark;
+      let R = throughRed[i] * (checks ? board : r), G = throughGreen[i] * (checks ? board : g);
+      let B = throughBlue[i] * (checks ? board : b);
       if (red !== undefined) { R += HALF[red[i]]; G += HALF[green[i]]; B += HALF[blue[i]]; }
       out[at + x] = opaque(shown(R), shown(G), shown(B));
     }
@@ -227,12 +230,12 @@ function dimOthers(image, out, W, rows, columns, x0, x1) {
 
 // Where opacity crosses the chosen one between a pixel of the canvas and that above or to the left.
 function drawLine(image, out, W, rows, columns, x0, x1) {
-  const tau = image.planes.optical_depth, threshold = -Math.log1p(-state.iso);
+  const opacity = plane(image, "opacity"), threshold = state.iso;
   let above = new Uint8Array(W).fill(2), here = new Uint8Array(W); // 0 or 1; 2: there is no row
   for (let y = 0; y < rows.length; y++) {
     if (rows[y] < 0) continue;
     for (let x = x0, at = y * W + x0, row = rows[y] * width; x < x1; x++, at++) {
-      const over = here[x] = tau[row + columns[x]] >= threshold ? 1 : 0;
+      const over = here[x] = opacity[row + columns[x]] >= threshold ? 1 : 0;
       if (above[x] + over === 1 || (x > x0 && here[x - 1] !== over)) {
         out[at] = ((out[at] >> 8) & 255) > 110 ? opaque(0, 0, 0) : opaque(255, 255, 255);
       }
@@ -262,10 +265,10 @@ const counted = new Map();
 function counts(name) {
   const key = [name, state.left, state.log].join();
   if (counted.has(key)) return counted.get(key);
-  const values = plane(left(), name), tau = left().planes.optical_depth;
+  const values = plane(left(), name), opacity = plane(left(), "opacity");
   const bins = new Uint32Array(BINS);
   for (let i = 0; values && i < values.length; i++) {
-    if (!(tau[i] > 0) || !(values[i] < Infinity)) continue; // of what is visible
+    if (!(opacity[i] > 0) || !(values[i] < Infinity)) continue; // of what is visible
     const at = Math.floor(shareOf(values[i], name) * BINS);
     if (at >= 0 && at <= BINS) bins[Math.min(at, BINS - 1)]++;
   }
@@ -368,8 +371,7 @@ function valuesOf(image) {
   const i = cursor[1] * width + cursor[0], { planes } = image;
   const rgb = ["red", "green", "blue"].map((n) => planes[n] && HALF[planes[n][i]]);
   return [
-    show(-Math.expm1(-planes.optical_depth[i])), show(Math.exp(-planes.optical_depth[i])),
-    show(planes.optical_depth[i]), planes.depth ? show(planes.depth[i]) : "-",
+    show(plane(image, "opacity")[i]), show(planes.transmittance[i]), show(planes.optical_depth[i]), planes.depth ? show(planes.depth[i]) : "-",
     planes.red ? rgb.map((v) => Number(v.toPrecision(3))).join(", ") : "-",
   ];
 }

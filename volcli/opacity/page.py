@@ -7,7 +7,7 @@ page shows the value under the cursor and puts the volume before any background.
 A plane is packed so that it shrinks by half: the bytes of all numbers apart, first those of lowest
 order, each less the one before (modulo 256), deflated by zlib, in base64. Optical depth and depth
 are float32; colour is float16, premultiplied and linear, without its background. Transmittance and
-opacity follow from optical depth.
+opacity follow from optical depth, or are planes of their own where they do not.
 """
 
 from __future__ import annotations
@@ -80,6 +80,12 @@ def _image(maps: Maps) -> dict[str, Any]:
     """The packed planes of one image, and what the page says of it."""
     radiance = radiance_of(maps)
     planes = {"optical_depth": packed(maps.optical_depth)}
+    if maps.is_mean:  # else both follow from optical depth
+        planes["transmittance"] = packed(maps.transmittance)
+        planes["opacity"] = packed(maps.opacity)
+    if maps.through.ndim == 3:
+        for i, name in enumerate(("through_red", "through_green", "through_blue")):
+            planes[name] = packed(maps.through[..., i])
     if maps.depth is not None:
         planes["depth"] = packed(maps.depth)
     if radiance is not None:

@@ -201,13 +201,17 @@ def _looks_straight(brightest: Floats, opacity: Floats) -> bool | None:
 
 
 def _disagreement(maps: Maps) -> dict[str, float]:
-    """The largest differences of opacity between what the file says twice: 0 or rounding."""
+    """The largest differences of opacity between what the file says twice: 0 or rounding.
+
+    Means over samples or channels differ by more, as they should, and are not compared.
+    """
     found = {}
-    if "layer" in maps.source["optical_depth"] and "layer" in maps.source["transmittance"]:
-        found["transmittance.Y"] = _largest(maps.transmittance, 1 - maps.opacity)
-    alpha = maps.stored.find("A")
-    if alpha is not None and maps.source["opacity"] != "alpha" and not bool((alpha >= 1).all()):
-        found["A"] = _largest(alpha, maps.opacity)
+    layered = [name for name in ("transmittance", "optical_depth") if maps.source[name][0] == "l"]
+    if len(layered) == 2 and not maps.is_mean:
+        tau = -np.expm1(-maps.optical_depth)
+        found["transmittance"] = _largest(tau, 1 - maps.transmittance)
+    if "transmittance" in layered and maps.source["opacity"] == "alpha":
+        found["alpha"] = _largest(maps.opacity, 1 - maps.transmittance)
     return found
 
 
