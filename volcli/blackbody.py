@@ -66,11 +66,16 @@ WAVELENGTHS = (FIRST_NM + STEP_NM * np.arange(len(OBSERVER))) * 1e-9
 """(81,) metres."""
 
 
+HOTTEST = 1e9
+"""Kelvin. Colour no longer changes there, and light grows in proportion."""
+
+
 def blackbody_xyz(kelvin: ArrayLike) -> NDArray[np.float64]:
     """The colour of a blackbody, (...) kelvin to (..., 3) XYZ with Y in candela / m2.
 
     XYZ = 683 lm/W sum_i B(lambda_i, T) (x, y, z)(lambda_i) 5 nm, where B is Planck's spectral
-    radiance, 2 h c^2 / lambda^5 / (exp(h c / (lambda k T)) - 1). It is 0 at and below 0 K.
+    radiance, 2 h c^2 / lambda^5 / (exp(h c / (lambda k T)) - 1). It is 0 at and below 0 K; above
+    `HOTTEST` numbers may end.
     """
     return _observed(kelvin, np.zeros(np.shape(kelvin)))
 
@@ -90,7 +95,7 @@ def blackbody_rgb(kelvin: ArrayLike, normalized: bool) -> NDArray[np.float64]:
     if not normalized:
         return np.maximum(blackbody_xyz(t) @ RGB_FROM_XYZ.T, 0.0)
     # Relative to the far red end of the spectrum: Planck's law itself is 0 in float64 below 25 K.
-    reddest = H * C / (K * WAVELENGTHS[-1]) / np.where(t > 0, t, 1.0)
+    reddest = H * C / (K * WAVELENGTHS[-1]) / np.maximum(t, 1.0)
     rgb = np.maximum(_observed(t, reddest) @ RGB_FROM_XYZ.T, 0.0)
     luminance = np.where(t > 0, rgb @ LUMINANCE, 1.0)
     return rgb / luminance[..., None]
@@ -99,7 +104,8 @@ def blackbody_rgb(kelvin: ArrayLike, normalized: bool) -> NDArray[np.float64]:
 def _observed(kelvin: ArrayLike, shift: NDArray[np.float64]) -> NDArray[np.float64]:
     """(..., 3): XYZ of Planck's law times exp(shift), (...)."""
     t = np.asarray(kelvin, np.float64)[..., None]
-    x = np.where(t > 0, H * C / (K * WAVELENGTHS) / np.where(t > 0, t, 1.0), np.inf)
+    # Below 1 K colour no longer changes, and light is 0 in float64.
+    x = np.where(t > 0, H * C / (K * WAVELENGTHS) / np.maximum(t, 1.0), np.inf)
     # exp(shift) / (exp(x) - 1), without an overflow
     spectrum = np.exp(shift[..., None] - x) / -np.expm1(-x)
     spectrum *= 2 * H * C**2 / WAVELENGTHS**5

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from volcli.blackbody import blackbody_rgb
+from volcli.blackbody import HOTTEST, blackbody_rgb
 from volcli.errors import UsageError, VolumeError
 from volcli.schema import Job
 from volcli.sources import DEFAULT_MAP, Blackbody, Color, DensityRamp, Emission, Ramp
@@ -23,7 +23,9 @@ from volcli.srgb import linear_from_srgb
 Range = tuple[float, float]
 
 KNOTS = 1024
-"""Knots of a blackbody. From 0 to 3000 K it is off by less than 1e-5 of its brightest colour."""
+"""Knots of a blackbody. From 0 to 3000 K it is off by 5e-6 of its brightest colour between them; of
+luminance 1, from 100 to 3000 K, by 6e-4, where blue leaves sRGB.
+"""
 
 MAP_KNOTS = 256
 """Knots of a named map: as many as matplotlib's own have colours."""
@@ -180,13 +182,13 @@ def blackbody_table(blackbody: Blackbody, field: Range, key: str, where: str) ->
     Raises
     ------
     VolumeError
-        A temperature is below 0 K.
+        A temperature is below 0 K, or above `HOTTEST`.
     """
     low, high = field
     values = np.linspace(low, high if high > low else low + 1.0, KNOTS)
     kelvin = blackbody.scale * values + blackbody.offset
     ends = blackbody.scale * np.array([low, high]) + blackbody.offset
-    if not (ends.min() >= 0 and ends.max() < np.inf):
+    if not (ends.min() >= 0 and ends.max() <= HOTTEST):
         raise VolumeError(
             f"{where}: is {low:g} to {high:g}, which {key} makes {ends.min():g} to "
             f"{ends.max():g} K, which is no temperature; change {key}.scale or {key}.offset"
