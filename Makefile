@@ -41,6 +41,7 @@ gallery: $(SETUP)
 	$(BIN)/volcli render configs/explosion.toml -o docs/gallery/explosion.png --size 480x480 --set output.maps=[]
 	$(BIN)/volcli render configs/colored_smoke.toml -o docs/gallery/colored_smoke.png --size 336x480 --set output.maps=[]
 	$(BIN)/volcli render configs/rotated.toml -o docs/gallery/rotated.png --size 480x480 --set output.maps=[]
+	$(BIN)/volcli render configs/panorama.toml -o docs/gallery/panorama.png --size 800x400 --set camera.samples=9
 	$(BIN)/python docs/strip_headers.py docs/gallery/*.png
 
 # Needs the real OpenVDB library (Debian: apt-get install python3-openvdb).
