@@ -16,8 +16,11 @@ _ParserError: Any = typer.BadParameter.__mro__[2]
 
 COMMANDS = {
     "render": "Render a picture of a volume.",
+    "batch": "Render many pictures: sequences, sweeps, turntables.",
     "info": "List the grids of a volume.",
     "inspect": "Look at the opacity of images.",
+    "compare": "Compare two images, channel by channel.",
+    "recomposite": "Put another background behind a rendered picture.",
 }
 """The commands, each a function of its name in the module of its name, and their summaries."""
 

@@ -12,6 +12,7 @@ store.py        pixels to a file, whole or not at all
 read.py         an EXR's channels and header; the stored pixels of any image
 channels.py     the channels of any image, one plane each, for looking at
 background.py   any image as premultiplied, scene-linear colour
+flip.py         how different two pictures look
 color.py        colour spaces to linear
 pixels.py       arrays alone: rounding, scaling, counting what cannot be shown
 library.py      OpenImageIO's way of opening and of failing
@@ -19,6 +20,7 @@ library.py      OpenImageIO's way of opening and of failing
 
 from volcli.images.background import read_background
 from volcli.images.channels import Channels, read_channels
+from volcli.images.flip import flip
 from volcli.images.paths import check_output
 from volcli.images.read import read_exr
 from volcli.images.write import layer_channels, write_exr, write_map, write_png
@@ -27,6 +29,7 @@ from volcli.srgb import linear_from_srgb, srgb_from_linear
 __all__ = [
     "Channels",
     "check_output",
+    "flip",
     "layer_channels",
     "linear_from_srgb",
     "read_background",

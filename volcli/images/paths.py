@@ -10,7 +10,6 @@ from pathlib import Path
 from volcli.errors import OutputError, UsageError
 from volcli.images.library import reason_of
 
-
 IMAGES = (".exr", ".png")
 """The extensions of images that volcli writes."""
 

@@ -7,13 +7,17 @@ from the old background can be taken away again.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from volcli.errors import UsageError
-from volcli.images import linear_from_srgb, read_background
-from volcli.opacity.maps import NO_ALPHA, Floats, Maps
+from volcli.images import linear_from_srgb, read_background, write_exr, write_png
+from volcli.opacity.maps import NO_ALPHA, Floats, Maps, read_maps
+
+Background = tuple[float, float, float] | Path | str
+"""A linear colour, an image, or ``transparent``."""
 
 
 def radiance_of(maps: Maps) -> Floats | None:
@@ -72,6 +76,60 @@ def recomposite(maps: Maps, background: NDArray[np.float32] | None) -> Floats:
 def _channels(through: Floats) -> Floats:
     """(h, w, 1) or (h, w, 3)."""
     return through[..., None] if through.ndim == 2 else through
+
+
+def behind_of(background: Background, size: tuple[int, int]) -> NDArray[np.float32] | None:
+    """A background as premultiplied, linear colour: (4,), (h, w, 4), or None for ``transparent``.
+
+    Raises
+    ------
+    UsageError
+        An image cannot be read.
+    """
+    if background == "transparent":
+        return None
+    if isinstance(background, tuple):
+        return np.array([*background, 1.0], np.float32)
+    return read_background(background, size)
+
+
+def write_recomposite(
+    image: Path, output: Path, background: Background, *, bits: int = 8, overwrite: bool = True
+) -> list[str]:
+    """Read an image, put another background behind it, and write it; returns warnings.
+
+    An EXR keeps every other channel and the header, whose job names the new background, so that
+    this too can be taken away again.
+
+    Raises
+    ------
+    UsageError, OutputError, NonFiniteError
+        See `recomposite`; the result cannot be written, or PNG cannot hold it.
+    """
+    import tomli_w
+
+    maps = read_maps(image)
+    picture = recomposite(maps, behind_of(background, maps.stored.size))
+    job: dict[str, Any] = {**maps.job, "background": _as_table(background)}
+    header = {k: v for k, v in maps.stored.attributes.items() if k.startswith("volcli:")}
+    header |= {"Software": "volcli", "volcli:job": tomli_w.dumps(job)}
+    if output.suffix.lower() == ".png":
+        return write_png(output, picture, header, bits=bits, overwrite=overwrite)
+    channels = {c: picture[..., i] for i, c in enumerate("RGBA")}
+    kept = {n: plane for n, plane in maps.stored.planes.items() if n not in channels}
+    if not any(name.startswith("transmittance.") for name in kept):
+        kept["transmittance.Y"] = maps.transmittance
+    write_exr(output, channels | kept, header, overwrite=overwrite)
+    return []
+
+
+def _as_table(background: Background) -> dict[str, Any]:
+    """A background as the table of a job."""
+    if background == "transparent":
+        return {}
+    if isinstance(background, tuple):
+        return {"color": list(background)}
+    return {"image": str(Path(background).absolute())}
 
 
 def _rendered_background(maps: Maps) -> Floats | None:

@@ -111,7 +111,7 @@ def read_maps(path: str | os.PathLike[str]) -> Maps:
         return _of_one_map(stored, str(stored.attributes[MAP_HEADER]))
     alpha = stored.find("A", "alpha", *(n for n in stored.planes if n.lower().endswith(".a")))
     tau, transmittance = (_layer(stored, name) for name in ("optical_depth", "transmittance"))
-    covered = alpha is None or bool((alpha >= 1).all())
+    covered = alpha is None or bool((alpha >= 1 - SAME).all())
     source: dict[str, str] = {}
     if alpha is not None and not (covered and (tau is not None or transmittance is not None)):
         opacity, source["opacity"] = alpha, "alpha"
@@ -174,11 +174,7 @@ def _completed(
 
 def _of_one_map(stored: Channels, name: str) -> Maps:
     """The maps that one map of volcli's tells; a PNG's values are scaled back."""
-    low = float(stored.attributes.get("volcli:map_lo", 0.0))
-    high = float(stored.attributes.get("volcli:map_hi", 1.0))
-    values = _mean(np.stack(list(stored.planes.values()), axis=-1))
-    if (low, high) != (0.0, 1.0):
-        values = (low + values * np.float64(high - low)).astype(np.float32)
+    values = _map_values(stored)
     if name == "opacity":
         maps = _completed(stored, values, None, None, None, {"opacity": "the map"})
     elif name == "transmittance":
@@ -194,6 +190,23 @@ def _of_one_map(stored: Channels, name: str) -> Maps:
             f"picture, or a map of opacity, transmittance or optical_depth"
         )
     return maps
+
+
+def values_of_map(stored: Channels) -> tuple[str, Floats] | None:
+    """The name and the values of a file that is one map of volcli's; None of any other file."""
+    if MAP_HEADER not in stored.attributes:
+        return None
+    return str(stored.attributes[MAP_HEADER]), _map_values(stored)
+
+
+def _map_values(stored: Channels) -> Floats:
+    """(h, w): the values of a map; those of a PNG scaled back, the mean of those of a tint."""
+    low = float(stored.attributes.get("volcli:map_lo", 0.0))
+    high = float(stored.attributes.get("volcli:map_hi", 1.0))
+    values = _mean(np.stack(list(stored.planes.values()), axis=-1))
+    if (low, high) != (0.0, 1.0):
+        values = (low + values * np.float64(high - low)).astype(np.float32)
+    return values
 
 
 def _opacity_of(tau: Floats) -> Floats:

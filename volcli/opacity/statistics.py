@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from volcli.opacity.maps import Floats, Maps
+from volcli.opacity.maps import SAME, Floats, Maps
 
 PERCENTILES = (1, 5, 25, 50, 75, 95, 99)
 BINS = 64
@@ -168,10 +168,10 @@ def _colour(maps: Maps, visible: NDArray[np.bool_]) -> dict[str, Any] | None:
     brightest = np.maximum(np.maximum(planes[0], planes[1]), planes[2])  # type: ignore[arg-type]
     seen = brightest[visible]
     alpha = maps.stored.find("A")
-    covered = alpha is None or bool((alpha >= 1).all())
+    covered = alpha is None or bool((alpha >= 1 - SAME).all())
     found: dict[str, Any] = {
         "associated": maps.stored.associated,
-        "over_background": covered and not bool((maps.opacity >= 1).all()),
+        "over_background": covered and not bool((maps.opacity >= 1 - SAME).all()),
         "max": float(np.nanmax(seen, initial=0)),
         "above_1": int(np.count_nonzero(seen > 1)),
         "at_1": int(np.count_nonzero(seen >= 1)),
