@@ -78,7 +78,11 @@ WRONG = {
         3,
         "it has: density.*mean 'density'",
     ),
-    "level set": ("set.vdb -o a.exr", 3, r"'\[0\]' is a level set.*not a fog volume; take it as fog with --set density.level_set=fog"),
+    "level set": (
+        "set.vdb -o a.exr",
+        3,
+        r"'\[0\]' is a level set.*not a fog volume; take it as fog with --set density.level_set=fog",
+    ),
     "vectors as density": ("ball.npz -o a.exr --grid Cd", 3, "a scalar; choose another .*density"),
     "only vectors": ("vectors.vdb -o a.exr", 3, "'v' is vec3s, and a density is a scalar"),
     "unknown colour": ("ball.npz -o a.exr --color-grid cd", 3, "did you mean 'Cd'"),

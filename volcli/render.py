@@ -187,7 +187,7 @@ def render(
     def one_tile(corner: tuple[int, int]) -> int:
         rows = slice(corner[0], min(corner[0] + edge, height))
         columns = slice(corner[1], min(corner[1] + edge, width))
-        shape = (samples, *tau[rows, columns].shape)
+        shape = (samples, *light[rows, columns].shape[:2])
         origins, directions = camera.rays(
             slice(top + rows.start, top + rows.stop),
             slice(left + columns.start, left + columns.stop),
