@@ -291,6 +291,14 @@ def test_the_job_in_the_header_makes_the_identical_picture(folder, tmp_path, mon
     assert job == job_again
 
 
+@pytest.mark.needs_jit
+def test_the_job_in_the_header_names_what_was_chosen_of_the_camera(folder):
+    _, job = rendered("ball.npz")
+    assert job["camera"]["fov"] == 40
+    assert job["camera"]["resolution"] == [800, 600]
+    assert job["camera"]["eye"][:2] == job["camera"]["target"][:2]
+
+
 def test_the_header_says_what_made_the_picture(folder):
     rendered("ball.npz", *SMALL)
     _, attributes = read_exr("out.exr")

@@ -114,6 +114,14 @@ def test_a_picture_of_several_samples_does_not_depend_on_tiles_and_threads(count
         assert all(other == first for other in others), name
 
 
+def test_the_mean_of_a_pixel_is_added_up_alike_in_a_tile_of_one_pixel_and_of_many():
+    """NumPy's own sum is not: along one axis of one column it adds by pairs."""
+    values = np.random.default_rng(0).random((300, 5, 7))
+    whole = volcli.render._mean(values)
+    for y, x in np.ndindex(5, 7):
+        assert volcli.render._mean(values[:, y : y + 1, x : x + 1]) == whole[y, x]
+
+
 def test_depth_of_several_samples_is_that_of_a_hit_however_thin_the_medium():
     """Opacities near the smallest number there is still weigh the distances: all are 10."""
     m = medium(np.ones((8, 8, 8)), world_from_index=affine(np.diag([1.0, 1.0, 1e-9])))
