@@ -28,6 +28,8 @@ lint: $(SETUP)
 bench: $(SETUP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
 	$(BIN)/python -m benchmarks.accuracy
+	$(BIN)/python -m pytest benchmarks/test_parts.py -q --benchmark-json benchmarks/results/parts.json
+	$(BIN)/python -m benchmarks.startup
 	$(BIN)/python -m benchmarks.load
 	$(BIN)/python -m benchmarks.render
 	$(BIN)/python -m benchmarks.peers

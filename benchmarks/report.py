@@ -65,6 +65,17 @@ def render(results: dict[str, Any]) -> str:
 
 def load(results: dict[str, Any]) -> str:
     """Reading beside OpenVDB's."""
+    return _loaded(results) + "."
+
+
+def load_large(results: dict[str, Any]) -> str:
+    """The same of a large volume, and out of volcli's cache."""
+    (name,) = (key for key in results if key != "machine")
+    cached = results[name]["volcli"]["cached_seconds"]
+    return f"{_loaded(results)};\nout of the cache (`--cache`) {cached:.2f} s."
+
+
+def _loaded(results: dict[str, Any]) -> str:
     (name,) = (key for key in results if key != "machine")
     row = results[name]
     ours, theirs, ratio = row["volcli"], row["openvdb"], row["volcli_over_openvdb"]
@@ -72,8 +83,27 @@ def load(results: dict[str, Any]) -> str:
         f"for {row['voxels']:,} voxels {ours['seconds']['median']:.2f} s against "
         f"{theirs['seconds']['median']:.2f} s, {ratio['median']:.1f} times as\nlong "
         f"({ratio['min']:.1f} to {ratio['max']:.1f} over {ratio['rounds']} rounds), with a peak of "
-        f"{ours['peak_bytes'] / 1e6:.0f} MB for {ours['held_bytes'] / 1e6:.0f} MB of bricks."
+        f"{ours['peak_bytes'] / 1e6:.0f} MB for {ours['held_bytes'] / 1e6:.0f} MB of bricks"
     )
+
+
+def startup(results: dict[str, Any]) -> str:
+    """Whole processes, warm and cold."""
+    parts = ("start", "load", "compile", "render", "write")
+    rows = [["size", "kernels", "to the written EXR (least to most)", *parts]]
+    for kind, kernels in (("warm", "cached"), ("cold", "compiled")):
+        for size, row in results[kind].items():
+            seconds = row["written"]
+            rows.append(
+                [
+                    size,
+                    kernels,
+                    f"{seconds['median']:.2f} s ({seconds['min']:.2f} to {seconds['max']:.2f})",
+                    *(f"{row['parts'][part]:.2f}" for part in parts),
+                ]
+            )
+    beside = [f"{name} {1e3 * row['median']:.0f} ms" for name, row in results["beside"].items()]
+    return f"{_markdown(rows)}\n\n{results['volume']}; beside it, in turns: {', '.join(beside)}."
 
 
 def peers(results: dict[str, Any]) -> str:
@@ -150,10 +180,14 @@ def _markdown(rows: list[list[str]]) -> str:
     return "\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]])
 
 
+BLOCKS = (accuracy, peers, render, load, load_large, startup, scaling)
+"""What the README has a place for; each is made of the results of its name."""
+
+
 def main() -> None:
     """Rewrite the README's results."""
     text = README.read_text(encoding="utf-8")
-    for make in (accuracy, peers, render, load, scaling):
+    for make in BLOCKS:
         name = make.__name__
         results = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
         block = f"<!-- {name} -->\n{make(results)}\n<!-- /{name} -->"
