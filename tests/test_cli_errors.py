@@ -81,7 +81,7 @@ WRONG = {
     "level set": (
         "set.vdb -o a.exr",
         3,
-        r"'\[0\]' is a level set.*not a fog volume; take it as fog with --set density.level_set=fog",
+        r"'\[0\]' is a level set.*not a fog volume; take it .*density.level_set=fog",
     ),
     "vectors as density": ("ball.npz -o a.exr --grid Cd", 3, "a scalar; choose another .*density"),
     "only vectors": ("vectors.vdb -o a.exr", 3, "'v' is vec3s, and a density is a scalar"),

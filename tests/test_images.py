@@ -400,6 +400,22 @@ def test_what_png_cannot_hold_is_told_in_one_line(
     assert "\n" not in warning
 
 
+def test_of_light_that_png_cannot_hold_it_is_told_how_much(tmp_path: Path) -> None:
+    rgba = np.zeros((1, 4, 4))
+    rgba[0, 0] = [3, 0, 0, 0]  # fire without smoke
+    rgba[0, 1] = [1, 1, 0, 0.5]  # brighter than 1 where it is seen: 1 of 2 is kept
+    rgba[0, 2] = [0.5, 0.5, 0, 1]
+    alone, clipped = images.write_png(tmp_path / "a.png", rgba, {})
+    assert "1 of 4 pixels hold light where opacity is 0" in alone
+    assert "(50 % of the picture's light)" in alone
+    assert "1 of 4 pixels are brighter than 1" in clipped
+    assert "(16.7 % of the picture's light)" in clipped
+    rgba[0, 3] = [1e-5, 0, 0, 0]
+    rgba[0, :2] = 0
+    (little,) = images.write_png(tmp_path / "a.png", rgba, {})
+    assert "(less than 0.1 % of the picture's light)" in little
+
+
 def test_rounding_of_opaque_white_is_not_called_clipping(tmp_path: Path) -> None:
     opacity = -np.expm1(-np.geomspace(1e-6, 30, 4000)).astype(np.float32).reshape(40, 100)
     rgba = np.repeat(np.nextafter(opacity, np.float32(2))[..., None], 4, axis=2)

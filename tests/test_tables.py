@@ -69,7 +69,7 @@ def test_a_map_that_there_is_not_is_refused_with_a_guess(name, meant):
 
 
 def test_a_grid_of_one_value_has_no_range():
-    with pytest.raises(VolumeError, match="a: is 5 wherever .*give color.ramp.range"):
+    with pytest.raises(VolumeError, match=r"a: is 5 wherever .*give color\.ramp\.range"):
         ramp_table(Ramp(), (5.0, 5.0), "color.ramp", "a")
 
 
