@@ -101,6 +101,7 @@ def test_one_sample_is_the_picture_of_before_bit_by_bit():
         assert result.depth.tobytes() == np.float32(depth).tobytes()
 
 
+@pytest.mark.needs_jit
 @pytest.mark.parametrize("count", [2, 5, 64])
 def test_a_picture_of_several_samples_does_not_depend_on_tiles_and_threads(count, monkeypatch):
     m, source = noise()
@@ -153,6 +154,7 @@ def clipped_area(polygon, low, high):
     return abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2
 
 
+@pytest.mark.needs_jit
 def test_samples_converge_to_the_part_of_a_pixel_that_a_box_covers():
     """A homogeneous cube seen along its axis, turned in the picture: opacity is the part of the
     pixel that it covers times 1 - exp(-8 sigma)."""
