@@ -19,6 +19,7 @@ COMMANDS = {
     "batch": "Render many pictures: sequences, sweeps, turntables.",
     "info": "List the grids of a volume.",
     "inspect": "Look at the opacity of images.",
+    "probe": "Follow rays through a scene.",
     "compare": "Compare two images, channel by channel.",
     "recomposite": "Put another background behind a rendered picture.",
 }

@@ -67,8 +67,8 @@ def compare(
             raise UsageError(
                 f"--channels {channels}: both have {', '.join(pair.a)}; choose of these"
             )
-        both = ({name: image[name] for name in wanted} for image in (pair.a, pair.b))
-        pair = Pair(*both, encoding=pair.encoding, encoded=pair.encoded)
+        first, second = ({name: image[name] for name in wanted} for image in (pair.a, pair.b))
+        pair = Pair(first, second, pair.encoding, pair.encoded)
     found = compare_pair(pair)
     beyond = _beyond(found["channels"], max_error, rmse)
     if difference is not None:

@@ -36,6 +36,6 @@ def flip(
     import OpenImageIO as oiio
 
     bright = max(float(reference.max(initial=0)), float(test.max(initial=0))) > 1
-    pair = (oiio.ImageBuf(np.ascontiguousarray(p, np.float32)) for p in (reference, test))
-    found = oiio.ImageBufAlgo.FLIP_diff(*pair, hdr=int(bright))
+    a, b = (oiio.ImageBuf(np.ascontiguousarray(p, np.float32)) for p in (reference, test))
+    found = oiio.ImageBufAlgo.FLIP_diff(a, b, hdr=int(bright))
     return pixels_of(path, found)[..., 0], "HDR-FLIP" if bright else "LDR-FLIP"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -85,8 +87,8 @@ def averaged(values: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.f
         return total / count
 
 
-def _sums(values: NDArray[np.generic], size: tuple[int, int]) -> NDArray[np.float64]:
-    out = values
+def _sums(values: NDArray[Any], size: tuple[int, int]) -> NDArray[np.float64]:
+    out: NDArray[Any] = values
     for axis, n in enumerate(size):
         length = out.shape[axis]
         starts = np.minimum(np.arange(n) * length // n, length - 1)

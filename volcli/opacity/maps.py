@@ -23,6 +23,9 @@ from volcli.images import Channels, read_channels
 
 Floats = NDArray[np.float32]
 
+JOB_HEADER = "volcli:job"
+"""The header entry that holds the job as TOML."""
+
 MAP_HEADER = "volcli:map"
 """The header entry that names the map in a file that holds nothing else."""
 
@@ -72,7 +75,7 @@ class Maps:
     @cached_property
     def job(self) -> dict[str, Any]:
         """The tables of the job that the header holds; empty where it holds none."""
-        text = self.stored.attributes.get("volcli:job")
+        text = self.stored.attributes.get(JOB_HEADER)
         try:
             return tomllib.loads(str(text)) if text else {}
         except tomllib.TOMLDecodeError:
@@ -132,6 +135,24 @@ def read_maps(path: str | os.PathLike[str]) -> Maps:
             f"{', '.join(stored.planes)}; render an .exr, or an image with alpha"
         )
     return _completed(stored, opacity, transmittance, tau, stored.find("Z"), source)
+
+
+def job_of_picture(path: os.PathLike[str]) -> dict[str, Any]:
+    """The tables of the job in the header of a picture that volcli rendered.
+
+    Raises
+    ------
+    UsageError
+        The file cannot be read, or its header holds no job.
+    """
+    stored = read_channels(path)
+    text = stored.attributes.get(JOB_HEADER)
+    if not text:
+        raise UsageError(f"{path}: its header holds no job; give the volume, or a job file")
+    try:
+        return tomllib.loads(str(text))
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError(f"{path}: the job in its header is damaged: {error}") from error
 
 
 def _layer(stored: Channels, name: str) -> Floats | None:

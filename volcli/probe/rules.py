@@ -1,0 +1,83 @@
+"""One ray by volcli's own rules: what each makes of it, and where midpoint takes its samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from volcli.errors import UsageError
+from volcli.plan import Plan
+from volcli.probe.field import Floats, make_line
+from volcli.render import MAX_STEPS, Scene, Source, make_integrator
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a rule makes of a ray.
+
+    Attributes
+    ----------
+    rule
+        ``exact``, ``midpoint 0.5``, with ``, nearest`` where values are not blended.
+    tau
+        Optical depth.
+    radiance
+        (3,): the light of the volume alone.
+    evaluations
+        Cells or samples.
+    samples
+        (m,): distances from the origin of the samples of the midpoint rule; empty for others.
+    """
+
+    rule: str
+    tau: float
+    radiance: Floats
+    evaluations: int
+    samples: Floats
+
+
+def seen_by(scene: Scene, plan: Plan, origin: Floats, direction: Floats) -> Seen:
+    """What the rule of a plan makes of a ray, by the compiled kernels, in float64.
+
+    Raises
+    ------
+    UsageError
+        The step is so short that the ray would take more than `render.MAX_STEPS`.
+    """
+    samples = np.empty(0)
+    if plan.step_voxels is not None:
+        samples = sample_distances(scene, plan, origin, direction)
+    tau, light, _, evaluations = make_integrator(scene, plan)(origin[None], direction[None])
+    radiance = np.array(light[0], np.float64)
+    if not isinstance(scene.color, Source):
+        tint = 1.0 if scene.tint is None else np.array(scene.tint)
+        radiance = radiance + -np.expm1(-tau[0] * tint) * np.array(scene.color)
+    rule = plan.rule + (", nearest" if plan.nearest else "")
+    return Seen(rule, float(tau[0]), radiance, int(evaluations), samples)
+
+
+def with_step(plan: Plan, step_voxels: float | None) -> Plan:
+    """The plan with another rule: midpoint with a step, or exact."""
+    return replace(plan, step_voxels=step_voxels)
+
+
+def sample_distances(scene: Scene, plan: Plan, origin: Floats, direction: Floats) -> Floats:
+    """(m,): where the midpoint rule samples: in the middle of each step, the last one cut.
+
+    Raises
+    ------
+    UsageError
+        There would be more than `render.MAX_STEPS`.
+    """
+    line = make_line(scene.density, plan.nearest, origin, direction)
+    near, far = line.span
+    if scene.density.is_empty or not near < far:
+        return np.empty(0)
+    assert plan.step_voxels is not None, "asked for by the caller"
+    step = plan.step_voxels / float(np.linalg.norm(line.d))
+    count = (far - near) / step
+    if count > MAX_STEPS:
+        raise UsageError(f"--step {plan.step_voxels:g}: {count:.0e} samples of one ray; give more")
+    begin = np.arange(np.ceil(count)) * step
+    return near + (begin + np.minimum(begin + step, far - near)) / 2
