@@ -20,6 +20,7 @@ LAYERS = [
     {"render"},
     {"config", "images", "warmup", "scene"},
     {"run", "describe"},
+    {"batch"},
     {"cli"},
 ]
 """From the bottom to the top. A module may import those below it."""
@@ -132,6 +133,7 @@ def test_kernels_and_their_oracle_do_not_know_each_other():
         (["--help"], HEAVY | {"numpy", "tomli_w", "pydantic"}),
         (["render", "--help"], HEAVY | {"numpy", "tomli_w"}),
         (["info", "--help"], HEAVY | {"numpy", "tomli_w"}),
+        (["batch", "--help"], HEAVY | {"numpy", "tomli_w"}),
     ],
 )
 def test_help_loads_nothing_that_is_slow(arguments, slow):
@@ -206,6 +208,7 @@ def test_an_option_that_sets_a_field_has_the_help_of_the_schema_and_no_default_o
         "settings",
         "threads",
         "cache",
+        "frames",
         "overwrite",
         "explain",
         "as_json",

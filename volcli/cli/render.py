@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,12 +15,13 @@ from volcli.cli.options import background as parse_background
 from volcli.cli.options import names, numbers, option, size
 from volcli.cli.progress import Bars
 from volcli.cli.table import in_bytes, say, table, terminal_width
-from volcli.errors import UsageError
+from volcli.errors import BatchError, UsageError, VolcliError
 
 if TYPE_CHECKING:
     from volcli.plan import Plan, Term
     from volcli.render import Scene
     from volcli.run import Report
+    from volcli.schema import Job
 
 
 def render(
@@ -65,6 +66,15 @@ def render(
             metavar="KEY=VALUE",
             help="Any field of the job, such as density.nonfinite=zero; repeatable. No VALUE: the "
             "default.",
+        ),
+    ] = None,
+    frames: Annotated[
+        str | None,
+        typer.Option(
+            "--frames",
+            metavar="RANGES",
+            help="Frames of files named with ####, %04d or $F4: 7, 1-100, or 1-100x2,150. One that "
+            "fails does not stop the others.",
         ),
     ] = None,
     threads: Annotated[
@@ -128,7 +138,6 @@ def render(
     spelled = {key: f"{flag} {_typed(text)}" for key, flag, text, _ in flags if text is not None}
     spelled |= {key: f"--background {background}" for key, _ in behind}
     from volcli.config import load_job
-    from volcli.run import load, prepare_each, run
 
     job = load_job(
         source,
@@ -136,6 +145,50 @@ def render(
         settings=settings or [],
         spelled=spelled,
     )
+
+    def pictures_of(one: Job) -> None:
+        _render(one, threads, cache, overwrite, explain, as_json, quiet)
+
+    if frames is None:
+        pictures_of(job)
+    else:
+        _each_frame(job, frames, pictures_of, quiet)
+
+
+def _each_frame(job: Job, frames: str, render_one: Callable[[Job], None], quiet: bool) -> None:
+    """The frames of a sequence, one after another; what fails is told, and the rest goes on."""
+    from volcli.batch.expand import expand_frames
+    from volcli.batch.frames import as_ranges
+    from volcli.batch.orbit import is_framed
+
+    if is_framed(job.camera) and not quiet:
+        _warn(["no camera: each frame is framed by itself; --eye and --target keep it still"])
+    failed = []
+    jobs = expand_frames(job, frames)
+    for frame, one in jobs:
+        try:
+            render_one(one)
+        except VolcliError as error:
+            if len(jobs) == 1:
+                raise
+            print(f"volcli: frame {frame}: {error}", file=sys.stderr)
+            failed.append(frame)
+    if failed:
+        raise BatchError(f"{len(failed)} of {len(jobs)} frames failed: {as_ranges(failed)}")
+
+
+def _render(
+    job: Job,
+    threads: int | None,
+    cache: Path | None,
+    overwrite: bool,
+    explain: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """The pictures of a job, and what is printed of them."""
+    from volcli.run import load, prepare_each, run
+
     pictures = prepare_each(job, overwrite=overwrite, writes=not explain)
     prepared = pictures[0]
     with Bars(quiet) as bars:

@@ -1,0 +1,222 @@
+"""An engine of dask.distributed: an existing scheduler's workers, or a cluster on this machine.
+
+What is lost with a worker, and how often the scheduler tries again elsewhere, is the scheduler's to
+say (`distributed.scheduler.allowed-failures`); a task that it gives up comes back as lost.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import logging
+import os
+import queue
+import secrets
+import signal
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from volcli.batch.work import AT_ONCE, Limits, Outcome, Task, Worker
+from volcli.errors import UsageError, VolcliError
+
+_ANSWER_SECONDS = 10
+_LOOK_SECONDS = 1.0
+"""How often it is asked which workers there are."""
+
+_worker: Worker | None = None
+_making = threading.Lock()
+
+
+def is_installed() -> bool:
+    """Whether the extra ``farm`` is there."""
+    return importlib.util.find_spec("distributed") is not None
+
+
+class Farm:
+    """Workers of dask.distributed, as a `runner.Engine`.
+
+    Parameters
+    ----------
+    address
+        Of a scheduler; None: a cluster of ``count`` workers on this machine.
+    on_start
+        Called with the process id of each worker of this machine's cluster.
+
+    Raises
+    ------
+    UsageError
+        If the extra is not installed, or no scheduler answers.
+    """
+
+    def __init__(
+        self, address: str | None, count: int, limits: Limits, on_start: Callable[[int], None]
+    ) -> None:
+        if not is_installed():
+            raise UsageError("--scheduler needs dask.distributed: pip install 'volcli[farm]'")
+        from distributed import Client
+
+        # What it has to say of workers that die, and of ends, is told in outcomes and errors.
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        self._limits, self._on_start = limits, on_start
+        self._cluster = _cluster(count, limits) if address is None else None
+        self._name = address or "the local cluster"
+        try:
+            self._client = Client(
+                address or self._cluster, timeout=_ANSWER_SECONDS, set_as_default=False
+            )
+        except (OSError, TimeoutError, ValueError) as error:
+            raise UsageError(
+                f"--scheduler {address}: no scheduler answers there ({_line(error)}); start one "
+                "with: dask scheduler"
+            ) from error
+        if self._cluster is not None:
+            self._client.register_worker_callbacks(_ignore_interrupts)
+        self._ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._futures: dict[str, Any] = {}
+        self._alone = False
+        self._numbers = itertools.count()
+        self._batch = secrets.token_hex(4)
+        self._workers: set[str] = set()
+        self._looked = 0.0
+        self._pids: set[int] = set()
+        self._look()
+
+    def has_room(self, alone: bool) -> bool:
+        """Whether a task can be taken now; ``alone``: it is to be the only one there is."""
+        self._look()
+        if alone or self._alone:
+            return not self._futures
+        return len(self._futures) < AT_ONCE * max(1, len(self._workers))
+
+    def submit(self, task: Task, alone: bool) -> None:
+        """Give a task to the scheduler."""
+        future = self._client.submit(
+            _work,
+            task,
+            self._limits,
+            key=f"volcli-{self._batch}-{next(self._numbers)}",
+            pure=False,
+        )
+        self._alone = alone
+        self._futures[task.key] = future
+        future.add_done_callback(lambda ended, key=task.key: self._ended.put((key, ended)))
+
+    def wait(self, seconds: float) -> list[Outcome]:
+        """What has become of tasks, waiting no longer than that for the first."""
+        outcomes = []
+        with suppress(queue.Empty):
+            key, future = self._ended.get(timeout=seconds)
+            while True:
+                outcomes.append(self._outcome(key, future))
+                key, future = self._ended.get_nowait()
+        if self._client.status in ("closed", "closing"):
+            raise self._gone()
+        return outcomes
+
+    def close(self) -> None:
+        """Leave the scheduler; tasks that have not begun are taken back."""
+        with suppress(Exception):  # a scheduler that has gone away cannot be told
+            self._client.cancel(list(self._futures.values()), force=True)
+        with suppress(Exception):
+            self._client.close(timeout=2)
+        if self._cluster is not None:
+            with suppress(Exception):
+                self._cluster.close(timeout=10)
+
+    def _outcome(self, key: str, future: Any) -> Outcome:
+        from distributed import KilledWorker
+
+        del self._futures[key]
+        alone, self._alone = self._alone, False
+        if future.status == "finished":
+            try:
+                outcome: Outcome = future.result()
+            except Exception as error:  # it was computed, and lost before it was fetched
+                return Outcome(key, f"its result was lost ({_line(error)})", lost=not alone)
+            if self._cluster is not None:
+                self._seen(outcome.pid)
+            return outcome
+        if future.status in ("cancelled", "lost"):
+            raise self._gone()
+        failure = future.exception()
+        if isinstance(failure, KilledWorker):
+            what = "its worker died; by hand, or because it ran out of memory"
+            return Outcome(key, what, lost=not alone)
+        return Outcome(key, f"its worker could not begin it ({_line(failure)})")
+
+    def _look(self) -> None:
+        """Which workers there are; asked again once a while."""
+        if time.monotonic() - self._looked < _LOOK_SECONDS and self._workers:
+            return
+        self._looked = time.monotonic()
+        try:
+            workers = set(self._client.nthreads())
+            if self._cluster is not None and workers != self._workers:
+                for pid in self._client.run(os.getpid, on_error="ignore").values():
+                    self._seen(pid)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise self._gone() from error
+        self._workers = workers
+
+    def _seen(self, pid: int) -> None:
+        if pid not in self._pids:
+            self._pids.add(pid)
+            self._on_start(pid)
+
+    def _gone(self) -> VolcliError:
+        return VolcliError(
+            f"{self._name}: the scheduler has gone away; what is done is recorded, and --resume "
+            "goes on once there is one"
+        )
+
+
+def _cluster(count: int, limits: Limits) -> Any:
+    """A cluster on this machine that nobody else can use: its port asks for a certificate."""
+    import dask
+    from distributed import LocalCluster, Security
+
+    # Once a worker has died its tasks come back, and are tried again one by one.
+    with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
+        return LocalCluster(
+            n_workers=count,
+            threads_per_worker=AT_ONCE,
+            processes=True,
+            memory_limit=limits.memory or 0,
+            dashboard_address=None,
+            security=Security.temporary(),
+            silence_logs=logging.CRITICAL,
+        )
+
+
+def _ignore_interrupts() -> None:
+    """On a worker of this machine: Ctrl-C is for the batch, which ends its workers."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _work(task: Task, limits: Limits) -> Outcome:
+    """On a worker: do a task, with what the tasks of its process share."""
+    global _worker
+    with _making:
+        if _worker is None:
+            _worker = Worker(_own(limits))
+    return _worker.work(task)
+
+
+def _own(limits: Limits) -> Limits:
+    """Limits, with what the batch leaves open set to what the worker was started with."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    memory = worker.memory_manager.memory_limit
+    return Limits(
+        threads=limits.threads or worker.state.nthreads,
+        memory=limits.memory or memory,
+        cache=limits.cache,
+    )
+
+
+def _line(error: BaseException | None) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
