@@ -247,11 +247,15 @@ def _sum(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _mean(values: NDArray[Any]) -> NDArray[Any]:
-    return _sum(values) / len(values)
+    """The mean over the first axis, the samples of a pixel."""
+    return values[0] if len(values) == 1 else _sum(values) / len(values)
 
 
 def _mean_depth(depth: NDArray[Any], opacity: NDArray[Any]) -> NDArray[Any]:
     """The mean over the first axis, weighted with the probability of a hit; +inf where it is 0."""
+    if len(depth) == 1:
+        one: NDArray[Any] = depth[0]
+        return one
     hit = opacity > 0
     total = _sum(opacity)
     weight = opacity / np.where(total > 0, total, 1.0)
