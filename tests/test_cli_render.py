@@ -250,12 +250,13 @@ def test_paths_of_a_job_are_relative_to_it_and_those_of_flags_to_the_user(folder
     (folder / "jobs").mkdir()
     (folder / "jobs" / "job.toml").write_text(
         "[density]\nfile = '../ball.npz'\n[background]\nimage = 'sky.png'\n"
-        "[output]\nimage = 'a.exr'\n"
+        "[output]\nimage = 'a.exr'\n[color]\nfile = 'c.vdb'\n[emission]\nfile = 'e.vdb'\n"
     )
     job = resolved("jobs/job.toml")
     assert job["density"]["file"] == "jobs/../ball.npz"
     assert job["background"]["image"] == "jobs/sky.png"
     assert job["output"]["image"] == "jobs/a.exr"
+    assert (job["color"]["file"], job["emission"]["file"]) == ("jobs/c.vdb", "jobs/e.vdb")
     assert resolved("jobs/job.toml", "-o", "b.exr")["output"]["image"] == "b.exr"
 
 

@@ -202,6 +202,8 @@ def _terms(
         terms.append(Term("optical depth", False, "density.scale is 0: nothing absorbs"))
     else:
         why = f"every picture needs it: {_how(job)}"
+        if job.density.level_set is not None:
+            why += "; a level set, as fog"
         terms.append(reads("optical depth", why, density, files[0], 1))
         if job.density.ramp is not None:
             terms.append(Term("transfer", True, "density.ramp is set", evaluations=1))
