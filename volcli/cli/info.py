@@ -24,8 +24,9 @@ def info(
 ) -> None:
     """List the grids of a volume.
 
-    Types, transforms and boxes; with --stats, what their values are. Without --stats only headers
-    are read, and counts and boxes are what the file declares.
+    Types, transforms and boxes; with --stats, what their values are, and whether a picture would
+    look empty or solid. Without --stats only headers are read, and counts and boxes are what the
+    file declares.
     """
     from volcli.config import make_job
     from volcli.describe import describe
@@ -42,6 +43,9 @@ def info(
     for grid in grids:
         if grid["refusal"]:
             say(f"{grid['grid']}: cannot be rendered: {grid['refusal']}")
+        if grid.get("optical_depth"):
+            median = f"median optical depth through the box {grid['optical_depth']['50']:.3g}"
+            say(f"{grid['grid']}: {median}{'; ' + grid['advice'] if grid['advice'] else ''}")
 
 
 _Columns = list[tuple[str, str]]
@@ -57,7 +61,9 @@ _GROUPS: list[_Columns] = [
     [
         ("box (index)", "box"),
         ("transform", "transform"),
+        ("background", "background"),
         ("stored as", "stored"),
+        ("use", "use"),
     ],
     [
         ("min", "min"),
@@ -65,7 +71,8 @@ _GROUPS: list[_Columns] = [
         ("max", "max"),
         ("leaves", "leaves"),
         ("tiles", "tiles"),
-        ("NaN/Inf", "nonfinite"),
+        ("NaN", "nan"),
+        ("Inf", "inf"),
         ("below 0", "negative"),
         ("memory", "memory_bytes"),
     ],
