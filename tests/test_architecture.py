@@ -13,13 +13,15 @@ PACKAGE = Path(__file__).parents[1] / "volcli"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 LAYERS = [
-    {"errors", "fields", "srgb", "blackbody"},
+    {"errors", "fields", "files", "srgb", "blackbody"},
     {"sources", "grids", "quadrature"},
     {"schema"},
-    {"plan", "camera", "transforms", "kernels", "tables"},
+    {"plan", "camera", "transforms", "kernels", "tables", "columns"},
     {"render"},
     {"config", "images", "warmup", "scene"},
+    {"opacity"},
     {"run", "describe"},
+    {"probe"},
     {"batch"},
     {"cli"},
 ]
@@ -133,6 +135,9 @@ def test_kernels_and_their_oracle_do_not_know_each_other():
         (["--help"], HEAVY | {"numpy", "tomli_w", "pydantic"}),
         (["render", "--help"], HEAVY | {"numpy", "tomli_w"}),
         (["info", "--help"], HEAVY | {"numpy", "tomli_w"}),
+        (["inspect", "--help"], HEAVY | {"numpy", "tomli_w"}),
+        (["probe", "--help"], HEAVY | {"numpy", "tomli_w"}),
+        (["compare", "--help"], HEAVY | {"numpy", "tomli_w"}),
         (["batch", "--help"], HEAVY | {"numpy", "tomli_w"}),
     ],
 )
@@ -173,12 +178,29 @@ def render_options():
     """Parameter -> (default, typer's option) of `volcli render`."""
     from volcli.cli.render import render
 
-    hints = typing.get_type_hints(render, include_extras=True)
+    return options_of(render)
+
+
+def options_of(command):
+    """Parameter -> (default, typer's option) of a command."""
+    hints = typing.get_type_hints(command, include_extras=True)
     return {
         name: (parameter.default, typing.get_args(hints[name])[1])
-        for name, parameter in inspect.signature(render).parameters.items()
+        for name, parameter in inspect.signature(command).parameters.items()
         if hasattr(hints[name], "__metadata__")
     }
+
+
+def test_the_options_of_probe_that_set_a_field_are_those_of_render():
+    from volcli.cli.probe import probe
+
+    here, rendered = options_of(probe), render_options()
+    shared = set(here) & set(rendered) - {"source", "step", "as_json", "overwrite"}
+    assert len(shared) > 10
+    for name in shared:
+        assert here[name][0] == rendered[name][0]
+        assert here[name][1].help == rendered[name][1].help
+        assert here[name][1].param_decls == rendered[name][1].param_decls
 
 
 def test_an_option_that_sets_a_field_has_the_help_of_the_schema_and_no_default_of_its_own():
