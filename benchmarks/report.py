@@ -90,7 +90,7 @@ def _loaded(results: dict[str, Any]) -> str:
 def startup(results: dict[str, Any]) -> str:
     """Whole processes, warm and cold."""
     parts = ("start", "load", "compile", "render", "write")
-    rows = [["size", "kernels", "to the written EXR (least to most)", *parts]]
+    rows = [["size", "kernels", "to the written EXR (least to most)", "busy", *parts]]
     for kind, kernels in (("warm", "cached"), ("cold", "compiled")):
         for size, row in results[kind].items():
             seconds = row["written"]
@@ -99,6 +99,7 @@ def startup(results: dict[str, Any]) -> str:
                     size,
                     kernels,
                     f"{seconds['median']:.2f} s ({seconds['min']:.2f} to {seconds['max']:.2f})",
+                    f"{row['busy']['median']:.2f}",
                     *(f"{row['parts'][part]:.2f}" for part in parts),
                 ]
             )

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,38 +23,50 @@ from benchmarks.common import summary, write_results
 
 SAMPLE = Path(__file__).parents[1] / "samples" / "cloud.vdb"
 SIZES = ("200x150", "800x600")
-ROUNDS = 3
-COLD_ROUNDS = 1
+ROUNDS = 11
+COLD_ROUNDS = 3
 
 SCRIPT = "from volcli.cli import main; main()"
 
 
-def start(code: str, folder: Path, *arguments: str) -> tuple[float, str]:
-    """Run a program in an interpreter of its own: seconds, and what it printed."""
+@dataclass(frozen=True)
+class Ran:
+    """A process: its seconds from start to end, those that it kept a processor busy, its output."""
+
+    seconds: float
+    busy_seconds: float
+    printed: str
+
+
+def start(code: str, folder: Path, *arguments: str) -> Ran:
+    """Run a program in an interpreter of its own."""
     clean = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
     env = clean | {"PYTHONPYCACHEPREFIX": str(folder / "bytecode"), "XDG_CACHE_HOME": str(folder)}
     env.pop("NUMBA_CACHE_DIR", None)
-    begin = time.perf_counter()
+    before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     command = [sys.executable, "-c", code, *arguments]
     done = subprocess.run(command, check=True, capture_output=True, text=True, env=env)
-    return time.perf_counter() - begin, done.stdout
+    seconds, after = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
+    busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return Ran(seconds, busy, done.stdout)
 
 
 def picture(folder: Path, size: str) -> dict[str, float]:
-    """Seconds of one picture: to the end of the process, to the file, and of each part."""
+    """Seconds of one picture: to the end of the process, busy, to the file, and of each part."""
     out = folder / "out.exr"
     begin = time.time_ns()
     arguments = ["render", str(SAMPLE), "-o", str(out), "--size", size, "--json"]
-    whole, said = start(SCRIPT, folder, *arguments)
+    ran = start(SCRIPT, folder, *arguments)
     # When the file was given its name: the last thing that happens to it.
     written = (out.stat().st_ctime_ns - begin) * 1e-9
-    parts = json.loads(said)["seconds"]
-    return {"whole": whole, "written": written, **parts, "start": written - sum(parts.values())}
+    parts = json.loads(ran.printed)["seconds"]
+    totals = {"whole": ran.seconds, "busy": ran.busy_seconds, "written": written}
+    return {**totals, **parts, "start": written - sum(parts.values())}
 
 
 def medians(rounds: list[dict[str, float]]) -> dict[str, Any]:
     """Summaries of the totals, medians of the parts."""
-    totals = ("written", "whole")
+    totals = ("written", "whole", "busy")
     return {name: summary([r[name] for r in rounds]) for name in totals} | {
         "parts": {
             name: statistics.median(r[name] for r in rounds)
@@ -73,8 +87,8 @@ def main() -> None:
         for _ in range(ROUNDS):
             for size in SIZES:
                 warm[size].append(picture(folder, size))
-            others["interpreter"].append(start("", folder)[0])
-            others["import numba"].append(start("import numba", folder)[0])
+            others["interpreter"].append(start("", folder).seconds)
+            others["import numba"].append(start("import numba", folder).seconds)
         for _ in range(COLD_ROUNDS):
             with tempfile.TemporaryDirectory(dir=folder) as empty:
                 (Path(empty) / "bytecode").symlink_to(folder / "bytecode")

@@ -123,7 +123,7 @@ def test_the_parts_of_a_start_add_up_to_it(tmp_path, monkeypatch):
         begin = time.perf_counter()
         ran = volcli(*arguments)
         assert ran.code == 0, ran.err
-        return time.perf_counter() - begin, ran.out
+        return startup.Ran(time.perf_counter() - begin, 0.0, ran.out)
 
     monkeypatch.setattr(startup, "start", in_this_process)
     row = startup.picture(tmp_path, "16x12")
