@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from volcli.config import job_as_toml, load_job, make_job, parse_setting
 from volcli.errors import UsageError
-from volcli.schema import MAPS, Job, field
+from volcli.schema import MAPS, Job, field, keys
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 positive = st.floats(min_value=1e-300, allow_infinity=False)
@@ -267,3 +267,49 @@ def test_a_number_is_written_as_one(key, value):
     with pytest.raises(UsageError, match=f"^a.toml: {key}: must be a number, not "):
         part, name = key.split(".")
         make_job({part: {name: value}}, source="a.toml")
+
+
+STOPS = [[0, 0, 0, 0], [1, 1, 1, 1]]
+
+
+@pytest.mark.parametrize(
+    ("file", "settings", "expected"),
+    [
+        ({"grid": "Cd"}, [("color.ramp.map", "jet")], {"ramp": {"map": "jet"}}),
+        ({"grid": "Cd"}, [("color.blackbody.grid", "T")], {"blackbody": {"grid": "T"}}),
+        ({"ramp": {"map": "jet"}}, [("color.grid", "Cd")], {"grid": "Cd"}),
+        ({"ramp": {"map": "jet"}}, [("color.constant", [1, 0, 0])], {"constant": (1, 0, 0)}),
+        (
+            {"ramp": {"grid": "T", "map": "jet", "range": [0, 1]}},
+            [("color.ramp.stops", STOPS)],
+            {"ramp": {"grid": "T", "stops": STOPS}},
+        ),
+        (
+            {"ramp": {"grid": "T", "stops": STOPS}},
+            [("color.ramp.range", [0, 2])],
+            {"ramp": {"grid": "T", "range": [0, 2]}},
+        ),
+        (
+            {"ramp": {"grid": "T", "map": "jet"}},
+            [("color.ramp.map", None)],
+            {"ramp": {"grid": "T"}},
+        ),
+        ({"ramp": {"map": "jet"}, "strength": 2}, [("color.ramp", None)], {"strength": 2}),
+    ],
+)
+def test_a_setting_inside_a_table_drops_what_the_table_excludes(file, settings, expected):
+    before = repr(file)
+    job = make_job({"color": file}, settings)
+    assert job == make_job({"color": expected})
+    assert repr(file) == before, "what was given is left alone"
+
+
+@pytest.mark.parametrize("key", ["color.ramp.map", "density.ramp.stops", "color.blackbody.scale"])
+def test_a_field_inside_a_table_has_help(key):
+    assert field(key)[0].endswith(".")
+
+
+def test_every_field_is_described_those_of_tables_too():
+    for key in keys():
+        if "." in key:
+            assert field(key)[0].endswith("."), key
