@@ -64,7 +64,7 @@ def each_camera(job: Job) -> tuple[Job, ...]:
         number = job.camera.frame or 0
         if number >= count:
             raise UsageError(
-                f"{path}: there is no frame {number} (camera.frame): it has {count}, from 0"
+                f"{path}: there is no frame {number} (camera.frame); it has {count}, the first is 0"
             )
         return (_with_camera(job, path, document, number),)
     image = job.output.image
