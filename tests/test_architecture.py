@@ -13,8 +13,8 @@ PACKAGE = Path(__file__).parents[1] / "volcli"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 LAYERS = [
-    {"errors", "fields", "files", "srgb", "blackbody"},
-    {"sources", "grids", "quadrature"},
+    {"errors", "fields", "srgb", "blackbody"},
+    {"sources", "grids", "quadrature", "files"},
     {"schema"},
     {"plan", "camera", "transforms", "kernels", "tables", "columns"},
     {"render"},

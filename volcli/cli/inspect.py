@@ -217,8 +217,8 @@ def _percentiles(maps: dict[str, dict[str, Any]]) -> str:
         ["max", *(f"{found['max']:.4g}" for found in known.values())],
         ["mean", *(f"{found['mean']:.4g}" for found in known.values())],
     ]
-    if any(found["infinite"] for found in known.values()):
-        rows.append(["infinite", *(f"{found['infinite']:,} pixels" for found in known.values())])
+    if any(found["not_finite"] for found in known.values()):
+        rows.append(["not finite", *(f"{f['not_finite']:,} pixels" for f in known.values())])
     if _writes_unicode():
         bars = (_bars(found["histogram"]["counts"]) for found in known.values())
         rows.append(["min to max", *bars])

@@ -30,7 +30,9 @@ def shades(name: str) -> NDArray[np.uint8]:
         close = difflib.get_close_matches(name.lower(), known, n=1)
         meant = f"did you mean '{known[close[0]]}'?" if close else "such as viridis, magma, gray"
         raise UsageError(f"--colormap {name}: matplotlib has no such colour map; {meant}")
-    return np.asarray(colormaps[name](np.linspace(0, 1, 256), bytes=True)[:, :3], np.uint8)
+    colours = colormaps[name]
+    entries = np.rint(np.linspace(0, colours.N - 1, 256)).astype(int)  # a map of 256 as it is
+    return np.asarray(colours(entries, bytes=True)[:, :3], np.uint8)
 
 
 def limits(name: str, values: NDArray[np.float32], logarithmic: bool) -> tuple[float, float]:

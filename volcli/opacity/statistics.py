@@ -29,7 +29,7 @@ def statistics(maps: Maps) -> dict[str, Any]:
     -------
     ``image``, ``size``, ``format``, ``rule`` and ``density_scale`` (as far as the header tells);
     ``coverage``: shares of all pixels; ``maps``: for each map where it is from, ``min``, ``max``,
-    ``mean``, ``percentiles``, ``histogram``, and how many values are ``distinct`` or ``infinite``,
+    ``mean``, ``percentiles``, ``histogram``, and how many values are ``distinct`` or ``not_finite``,
     of visible pixels; ``visible_box``:
     the first and last column and row that hold any, and the ``edges`` of the picture that they
     touch; ``nonfinite``: channels that hold NaN or Inf; ``levels``: how finely opacity is stored;
@@ -76,9 +76,10 @@ def _describe(values: Floats, visible: NDArray[np.bool_]) -> dict[str, Any]:
     """The numbers of one map where it is visible and finite; None where no pixel is."""
     ordered = values[visible]
     ordered.sort()  # NaN and +Inf last
-    finite = ordered[: np.searchsorted(ordered, np.float32(np.inf))]
+    first = np.searchsorted(ordered, np.float32(-np.inf), side="right")
+    finite = ordered[first : np.searchsorted(ordered, np.float32(np.inf))]
     found: dict[str, Any] = {
-        "infinite": len(ordered) - len(finite),
+        "not_finite": len(ordered) - len(finite),
         "distinct": int(np.count_nonzero(finite[1:] != finite[:-1])) + 1 if len(finite) else 0,
     }
     if not len(finite):
@@ -166,13 +167,13 @@ def _colour(maps: Maps, visible: NDArray[np.bool_]) -> dict[str, Any] | None:
     if any(plane is None for plane in planes):
         return None
     brightest = np.maximum(np.maximum(planes[0], planes[1]), planes[2])  # type: ignore[arg-type]
-    seen = brightest[visible]
+    seen = brightest[visible & np.isfinite(brightest)]
     alpha = maps.stored.find("A")
     covered = alpha is None or bool((alpha >= 1 - SAME).all())
     found: dict[str, Any] = {
         "associated": maps.stored.associated,
         "over_background": covered and not bool((maps.opacity >= 1 - SAME).all()),
-        "max": float(np.nanmax(seen, initial=0)),
+        "max": float(seen.max(initial=0)),
         "above_1": int(np.count_nonzero(seen > 1)),
         "at_1": int(np.count_nonzero(seen >= 1)),
         "light_where_empty": int(np.count_nonzero(brightest > 0) - np.count_nonzero(seen > 0)),
@@ -216,5 +217,7 @@ def _disagreement(maps: Maps) -> dict[str, float]:
 
 
 def _largest(a: Floats, b: Floats) -> float:
+    """The largest difference of two maps where both are finite."""
     with np.errstate(invalid="ignore"):
-        return float(np.nanmax(np.abs(a - b), initial=0))
+        difference = np.abs(a - b)
+    return float(difference.max(where=np.isfinite(difference), initial=0))
