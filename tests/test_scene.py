@@ -242,6 +242,17 @@ def test_a_tint_and_a_level_set_are_told_by_the_plan(fire):
     assert (plan.tint, plan.level_set, plan.transfer) == (True, True, False)
 
 
+def test_a_level_set_that_is_a_source_too_is_read_for_each(fire, read):
+    """As fog it is another grid; the source has the distances as they are stored."""
+    scene, plan, _ = scene_of(fire, density={"level_set": "fog"}, color={"ramp": RAMP})
+    assert read == ["density", "density"]
+    first, colour = (t for t in plan.terms if t.grid == "density")
+    assert first.bytes_read == colour.bytes_read > 0
+    assert scene.density.field_range == (0, 1)
+    assert scene.color.grid.field_range[1] == 1
+    assert scene.color.grid.field_range[0] == pytest.approx(-0.1)
+
+
 def test_scenes_of_a_grid_alone_need_no_more_than_before():
     grid = object.__new__(BrickGrid)
     assert Scene(grid, 1.0, Source(grid)).emission is None

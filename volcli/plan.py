@@ -193,7 +193,8 @@ def _terms(
     def reads(name: str, why: str, header: GridHeader, file: Path, evaluations: int) -> Term:
         if (file, header.label) in read:
             return Term(name, True, f"{why}; read once", header.label, 0, evaluations)
-        read.add((file, header.label))
+        if header is not density or job.density.level_set is None:  # its distances are not kept
+            read.add((file, header.label))
         return Term(name, True, why, header.label, header.file_bytes, evaluations)
 
     nodes = NODES if job.quadrature.step_voxels is None else 1

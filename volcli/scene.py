@@ -1,6 +1,6 @@
 """From a job and its plan to a `Scene`: volumes opened, the grids of the plan read, tables made.
 
-What is read is what the plan names, each grid once. Nothing here renders.
+What is read is what the plan names, a grid that several terms use once. Nothing here renders.
 """
 
 from __future__ import annotations
@@ -83,6 +83,7 @@ def read_grids(
     """Read the grids that a plan names, with warnings on what was changed in their values.
 
     A grid that is a source and the density too is read once, as a source: see `density_of_source`.
+    (Not a level set, which as fog is another grid.)
 
     Parameters
     ----------
