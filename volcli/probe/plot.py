@@ -75,6 +75,12 @@ def _curve(walked: Walk) -> Any:
     return (begin[:, None] + (end - begin)[:, None] * parts).reshape(-1)
 
 
+def _tau_at(walked: Walk, t: Any) -> Any:
+    """Optical depth up to t: exact at the ends of cells, a straight line within."""
+    ends = np.append(walked.begin[:1], walked.end)
+    return np.interp(t, ends, np.append(0, np.cumsum(walked.tau)))
+
+
 def _draw_sigma(axes: Any, walked: Walk, ray: dict[str, Any], t: Any) -> None:
     axes.plot(t, walked.sigma(t), color="0.15", linewidth=1.2, label="sigma(t)")
     drawn = [rule for rule in ray["rules"] if 0 < len(rule["samples"]["t"]) <= MOST_DOTS]
@@ -87,8 +93,7 @@ def _draw_sigma(axes: Any, walked: Walk, ray: dict[str, Any], t: Any) -> None:
 
 
 def _draw_transmittance(axes: Any, walked: Walk, ray: dict[str, Any], t: Any) -> None:
-    tau = np.interp(t, np.append(walked.begin[:1], walked.end), np.append(0, np.cumsum(walked.tau)))
-    axes.plot(t, np.exp(-tau), color="0.15", linewidth=1.2)
+    axes.plot(t, np.exp(-_tau_at(walked, t)), color="0.15", linewidth=1.2)
     axes.set_ylim(0, 1.05)
     for T in FALLS:
         at = ray["falls"][str(T)]
@@ -99,11 +104,10 @@ def _draw_transmittance(axes: Any, walked: Walk, ray: dict[str, Any], t: Any) ->
 
 
 def _draw_light(axes: Any, walked: Walk, t: Any) -> None:
-    middle = (walked.begin + walked.end) / 2
-    length = walked.end - walked.begin
-    axes.plot(middle, walked.weight / length, color="0.15", linewidth=1.2, label="T sigma, mean")
+    through = np.exp(-_tau_at(walked, t))
+    axes.plot(t, through * walked.sigma(t), color="0.15", linewidth=1.2, label="T sigma")
     axes.set_ylim(bottom=0)
-    axes.legend(loc="upper left", fontsize=8)
+    axes.legend(loc="best", fontsize=8)
     seen = axes.twinx()
     total = np.cumsum(walked.light, axis=0)
     for c, (name, color) in enumerate(_CHANNELS.items()):

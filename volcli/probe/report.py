@@ -76,7 +76,8 @@ def table(walked: Walk) -> Floats:
     """(n, 9): a row of `COLUMNS` for each interval."""
     total = np.cumsum(walked.tau)
     length = walked.end - walked.begin
-    numbers = [walked.begin, walked.end, walked.tau / length, total, np.exp(-total), walked.weight]
+    sigma = np.divide(walked.tau, length, out=np.zeros_like(length), where=length > 0)
+    numbers = [walked.begin, walked.end, sigma, total, np.exp(-total), walked.weight]
     return np.column_stack([*numbers, walked.light])
 
 
@@ -92,7 +93,8 @@ def folded(columns: dict[str, list[float]], most: int) -> list[list[float]]:
     starts = np.unique(np.arange(most) * len(rows) // most)
     ends = np.append(starts[1:], len(rows)) - 1
     length = rows[:, 1] - rows[:, 0]
-    mass = np.add.reduceat(rows[:, 2] * length, starts) / np.add.reduceat(length, starts)
+    mass = np.add.reduceat(rows[:, 2] * length, starts)
+    mass /= np.maximum(np.add.reduceat(length, starts), np.finfo(float).tiny)
     sums = np.add.reduceat(rows[:, 5:], starts, axis=0)
     joined = np.column_stack([rows[starts, 0], rows[ends, 1], mass, rows[ends, 3:5], sums])
     return joined.tolist()
