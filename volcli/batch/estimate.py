@@ -13,14 +13,14 @@ from volcli.plan import Plan, make_plan
 from volcli.scene import Volumes, open_volumes
 from volcli.schema import Job
 
-PROCESS = 200_000_000
+PROCESS = 215_000_000
 """Bytes of a worker that holds nothing: Python, NumPy, numba and kernels."""
 VOXEL = 7.1
 """Bytes of bricks an active voxel of a float grid, measured (`benchmarks.scaling`)."""
 LOADING = 2.0
 """How many times its bricks a grid takes while it is read and built."""
-PIXEL = 29.0
-"""Bytes a pixel, measured (`benchmarks.scaling`)."""
+PIXEL = 86.0
+"""Bytes a pixel of an EXR while it is written and read back, measured."""
 
 _CGROUPS = Path("/sys/fs/cgroup")
 _UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}

@@ -30,6 +30,9 @@ from volcli.batch.identity import is_as_printed
 from volcli.errors import OutputError
 
 
+_START = b'{"event": '
+
+
 def read_manifest(path: Path) -> list[dict[str, Any]]:
     """The events of a manifest, in order; none where there is no file.
 
@@ -50,9 +53,19 @@ def read_manifest(path: Path) -> list[dict[str, Any]]:
             event = json.loads(line)
         except ValueError:
             continue  # cut off by a kill; what it told of is done again
-        if isinstance(event, dict):
+        if isinstance(event, dict) and isinstance(event.get("job", ""), str) and "event" in event:
             events.append(event)
     return events
+
+
+def _may_be_cut_off(path: Path) -> bool:
+    """Whether a file without a whole line is the beginning of a manifest, or is not there."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(_START))
+    except FileNotFoundError:
+        return True
+    return _START.startswith(start)
 
 
 class Record:
@@ -68,6 +81,8 @@ class Record:
         self.path = path
         self._events = read_manifest(path)
         self._jobs = {event["job"]: event for event in self._events if "job" in event}
+        if not self._events and not _may_be_cut_off(path):
+            raise OutputError(f"{path}: is there and is no manifest; name another file")
 
     @property
     def has_jobs(self) -> bool:
@@ -122,7 +137,11 @@ class Manifest(Record):
         except OSError as error:
             os.close(self._file)
             raise self._failed(error) from error
-        super().__init__(path)
+        try:
+            super().__init__(path)
+        except OutputError:
+            os.close(self._file)
+            raise
         size = os.fstat(self._file).st_size
         if size and os.pread(self._file, 1, size - 1) != b"\n":
             self._append(b"\n")  # ends a line that was cut off
