@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SETUP := $(VENV)/.installed
 
-.PHONY: demo test lint bench gallery samples clean
+.PHONY: demo test lint bench gallery gallery-elsewhere samples clean
 
 demo: $(SETUP)
 	mkdir -p out
@@ -44,6 +44,12 @@ gallery: $(SETUP)
 	$(BIN)/volcli render configs/colored_smoke.toml -o docs/gallery/colored_smoke.png --size 336x480 --set output.maps=[]
 	$(BIN)/volcli render configs/rotated.toml -o docs/gallery/rotated.png --size 480x480 --set output.maps=[]
 	$(BIN)/volcli render configs/panorama.toml -o docs/gallery/panorama.png --size 800x400 --set camera.samples=9
+	$(BIN)/python docs/strip_headers.py docs/gallery/*.png
+
+# Pictures of volumes that are not ours, from a folder that has them: make gallery-elsewhere VOLUMES=...
+gallery-elsewhere: $(SETUP)
+	$(BIN)/volcli render configs/elsewhere/oiio_sphere_Cd.toml -o docs/gallery/oiio_sphere_Cd.png --size 480x480 \
+	    --set density.file=$(VOLUMES)/oiio_sphere.vdb --set color.file=$(VOLUMES)/oiio_sphere_Cd.vdb
 	$(BIN)/python docs/strip_headers.py docs/gallery/*.png
 
 # Needs the real OpenVDB library (Debian: apt-get install python3-openvdb).
