@@ -1,6 +1,8 @@
 """Maps, statistics and findings: each number is what NumPy makes of the pixels directly."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -376,3 +378,24 @@ def test_the_samples_of_the_repository_look_neither_empty_nor_solid():
         grids = json.loads(volcli("info", path, "--stats", "--json").out)["grids"]
         (density,) = [g for g in grids if g.get("optical_depth")]
         assert density["advice"] is None, path
+
+
+@pytest.mark.needs_jit
+def test_a_picture_of_4096_pixels_squared_is_read_in_less_than_a_gigabyte_and_a_half(tmp_path):
+    tau = np.broadcast_to(np.linspace(0, 3, 4096, dtype=np.float32), (4096, 4096))
+    opacity = -np.expm1(-tau)
+    channels = {**dict.fromkeys("RGBA", opacity), "Z": np.where(opacity > 0, tau, np.inf)}
+    channels |= {"transmittance.Y": np.exp(-tau), "optical_depth.Y": tau}
+    images.write_exr(tmp_path / "large.exr", channels, {})
+    code = (
+        "import sys\nfrom volcli.cli import main\nfrom volcli.run import peak_memory_bytes\n"
+        "try: main()\nfinally: print(peak_memory_bytes(), file=sys.stderr)"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code, "inspect", tmp_path / "large.exr"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "4096x4096" in ended.stdout
+    assert int(ended.stderr.splitlines()[-1]) < 1.5e9

@@ -18,6 +18,9 @@ PERCENTILES = (1, 5, 25, 50, 75, 95, 99)
 BINS = 64
 
 _THREADS = 2  # sorting and counting release the interpreter lock
+_ROWS = 64
+"""Rows looked at at a time, so that what is made of them stays in the cache."""
+
 _SAMPLE = 1_000_000
 """Pixels, evenly spread, on which it is judged whether colour looks premultiplied."""
 
@@ -28,12 +31,12 @@ def statistics(maps: Maps) -> dict[str, Any]:
     Returns
     -------
     ``image``, ``size``, ``format``, ``rule`` and ``density_scale`` (as far as the header tells);
-    ``coverage``: shares of all pixels; ``maps``: for each map where it is from, ``min``, ``max``,
-    ``mean``, ``percentiles``, ``histogram``, and how many values are ``distinct`` or ``not_finite``,
-    of visible pixels; ``visible_box``:
-    the first and last column and row that hold any, and the ``edges`` of the picture that they
-    touch; ``nonfinite``: channels that hold NaN or Inf; ``levels``: how finely opacity is stored;
-    ``colour``: brightness and premultiplication; ``disagreement``: how far alpha and layers differ.
+    ``coverage``: shares of all pixels; ``maps``: for each map where it is from and, of the visible
+    pixels, ``min``, ``max``, ``mean``, ``percentiles``, ``histogram``, and how many values are
+    ``distinct`` or ``not_finite``; ``visible_box``: the first and last column and row that hold
+    any, and the ``edges`` of the picture that they touch; ``nonfinite``: channels that hold NaN or
+    Inf; ``levels``: how finely opacity is stored; ``colour``: brightness and premultiplication;
+    ``disagreement``: how far alpha and layers differ.
     """
     visible = maps.opacity > 0
     with ThreadPoolExecutor(_THREADS) as pool:
@@ -63,13 +66,19 @@ def statistics(maps: Maps) -> dict[str, Any]:
 
 def _coverage(opacity: Floats) -> dict[str, float]:
     """Shares of the pixels; ``saturated``: opacity is 1 as far as the file can tell."""
-    counts = {
-        "above_0": opacity > 0,
-        "above_0.5": opacity > 0.5,
-        "above_0.99": opacity > 0.99,
-        "saturated": opacity >= 1,
-    }
-    return {name: np.count_nonzero(mask) / opacity.size for name, mask in counts.items()}
+    counts = dict.fromkeys(("above_0", "above_0.5", "above_0.99", "saturated"), 0)
+    for rows in _bands(opacity):
+        band = opacity[rows]
+        counts["above_0"] += int(np.count_nonzero(band > 0))
+        counts["above_0.5"] += int(np.count_nonzero(band > 0.5))
+        counts["above_0.99"] += int(np.count_nonzero(band > 0.99))
+        counts["saturated"] += int(np.count_nonzero(band >= 1))
+    return {name: count / opacity.size for name, count in counts.items()}
+
+
+def _bands(plane: Floats) -> list[slice]:
+    """A few rows after the other."""
+    return [slice(y, y + _ROWS) for y in range(0, len(plane), _ROWS)]
 
 
 def _describe(values: Floats, visible: NDArray[np.bool_]) -> dict[str, Any]:
@@ -131,15 +140,20 @@ def _nonfinite(name: str, maps: Maps) -> dict[str, Any] | None:
     A depth of +Inf where nothing is visible is what it should be, and not counted.
     """
     plane = maps.stored.planes[name]
-    bad = ~np.isfinite(plane)
-    if plane is maps.depth:
-        bad &= ~((maps.opacity == 0) & (plane == np.inf))
-    count = int(np.count_nonzero(bad))
-    if not count:
-        return None
-    y, x = np.unravel_index(int(np.argmax(bad)), bad.shape)
-    nan = int(np.count_nonzero(np.isnan(plane)))
-    return {"channel": name, "nan": nan, "inf": count - nan, "first": [int(x), int(y)]}
+    nan = inf = 0
+    first = None
+    for rows in _bands(plane):
+        bad = ~np.isfinite(plane[rows])
+        if plane is maps.depth:
+            bad &= ~((maps.opacity[rows] == 0) & (plane[rows] == np.inf))
+        if not bad.any():
+            continue
+        if first is None:
+            y, x = np.unravel_index(int(np.argmax(bad)), bad.shape)
+            first = [int(x), int(y) + rows.start]
+        count = int(np.count_nonzero(np.isnan(plane[rows])))
+        nan, inf = nan + count, inf + int(np.count_nonzero(bad)) - count
+    return None if first is None else {"channel": name, "nan": nan, "inf": inf, "first": first}
 
 
 def _levels(maps: Maps, distinct: int, visible: NDArray[np.bool_]) -> dict[str, Any]:
@@ -166,25 +180,39 @@ def _colour(maps: Maps, visible: NDArray[np.bool_]) -> dict[str, Any] | None:
     planes = [maps.stored.find(name) for name in "RGB"]
     if any(plane is None for plane in planes):
         return None
-    brightest = np.maximum(np.maximum(planes[0], planes[1]), planes[2])  # type: ignore[arg-type]
-    seen = brightest[visible & np.isfinite(brightest)]
     alpha = maps.stored.find("A")
     covered = alpha is None or bool((alpha >= 1 - SAME).all())
+    most = 0.0
+    above = at = dark = 0
+    for rows in _bands(maps.opacity):
+        brightest = _brightest(planes, rows)
+        seen = brightest[visible[rows] & np.isfinite(brightest)]
+        most = max(most, float(seen.max(initial=0)))
+        above += int(np.count_nonzero(seen > 1))
+        at += int(np.count_nonzero(seen >= 1))
+        dark += int(np.count_nonzero((brightest > 0) & ~visible[rows]))
     found: dict[str, Any] = {
         "associated": maps.stored.associated,
         "over_background": covered and not bool((maps.opacity >= 1 - SAME).all()),
-        "max": float(seen.max(initial=0)),
-        "above_1": int(np.count_nonzero(seen > 1)),
-        "at_1": int(np.count_nonzero(seen >= 1)),
-        "light_where_empty": int(np.count_nonzero(brightest > 0) - np.count_nonzero(seen > 0)),
+        "max": most,
+        "above_1": above,
+        "at_1": at,
+        "light_where_empty": dark,
         "straight": None,
     }
     if maps.stored.associated and not covered:
-        every = max(1, brightest.size // _SAMPLE)
+        step = max(1, round((maps.opacity.size / _SAMPLE) ** 0.5))
+        some = slice(None, None, step)
         found["straight"] = _looks_straight(
-            brightest.ravel()[::every], maps.opacity.ravel()[::every]
+            _brightest(planes, some)[:, some].ravel(), maps.opacity[some, some].ravel()
         )
     return found
+
+
+def _brightest(planes: list[Floats | None], rows: slice) -> Floats:
+    """The brightest of the channels in some rows."""
+    red, green, blue = (plane[rows] for plane in planes if plane is not None)
+    return np.maximum(np.maximum(red, green), blue)
 
 
 def _looks_straight(brightest: Floats, opacity: Floats) -> bool | None:
@@ -209,15 +237,21 @@ def _disagreement(maps: Maps) -> dict[str, float]:
     found = {}
     layered = [name for name in ("transmittance", "optical_depth") if maps.source[name][0] == "l"]
     if len(layered) == 2 and not maps.is_mean:
-        tau = -np.expm1(-maps.optical_depth)
-        found["transmittance"] = _largest(tau, 1 - maps.transmittance)
+        largest = 0.0
+        for rows in _bands(maps.opacity):
+            opacity = -np.expm1(-maps.optical_depth[rows])
+            largest = max(largest, _largest(opacity, maps.transmittance[rows]))
+        found["transmittance"] = largest
     if "transmittance" in layered and maps.source["opacity"] == "alpha":
-        found["alpha"] = _largest(maps.opacity, 1 - maps.transmittance)
+        found["alpha"] = _largest(maps.opacity, maps.transmittance)
     return found
 
 
 def _largest(a: Floats, b: Floats) -> float:
-    """The largest difference of two maps where both are finite."""
-    with np.errstate(invalid="ignore"):
-        difference = np.abs(a - b)
-    return float(difference.max(where=np.isfinite(difference), initial=0))
+    """The largest difference of opacities ``a`` and 1 - ``b`` where both are finite."""
+    largest = 0.0
+    for rows in _bands(a):
+        with np.errstate(invalid="ignore"):
+            difference = np.abs(a[rows] - (1 - b[rows]))
+        largest = max(largest, float(difference.max(where=np.isfinite(difference), initial=0)))
+    return largest
