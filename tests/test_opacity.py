@@ -388,8 +388,8 @@ def test_a_picture_of_4096_pixels_squared_is_read_in_less_than_a_gigabyte_and_a_
     channels |= {"transmittance.Y": np.exp(-tau), "optical_depth.Y": tau}
     images.write_exr(tmp_path / "large.exr", channels, {})
     code = (
-        "import sys\nfrom volcli.cli import main\nfrom volcli.run import peak_memory_bytes\n"
-        "try: main()\nfinally: print(peak_memory_bytes(), file=sys.stderr)"
+        "import sys\nfrom volcli.cli.app import run_app\nfrom volcli.run import peak_memory_bytes\n"
+        "run_app(sys.argv[1:])\nprint(peak_memory_bytes(), file=sys.stderr)"
     )
     ended = subprocess.run(
         [sys.executable, "-c", code, "inspect", tmp_path / "large.exr"],
