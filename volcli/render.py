@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,9 @@ from volcli.errors import NonFiniteError, UsageError
 from volcli.grids import BrickGrid, Progress
 from volcli.plan import Plan
 from volcli.tables import ColorTable, TransferTable
+
+if TYPE_CHECKING:
+    from volcli.kernels.integrator import Integrator
 
 Floats = NDArray[np.float32]
 
@@ -281,13 +284,11 @@ def over(result: RenderResult, background: Floats | None) -> Floats:
     return picture + seen * behind
 
 
-def make_integrator(
-    scene: Scene, plan: Plan
-) -> Callable[[NDArray[Any], NDArray[Any]], tuple[Any, ...]]:
+def make_integrator(scene: Scene, plan: Plan) -> Integrator:
     """A function of (origins, directions) to (tau, radiance, distance, evaluations)."""
-    from volcli.kernels.rays import Density, integrate_rays
+    from volcli.kernels import integrator
+    from volcli.kernels.rays import Density
     from volcli.kernels.source import Colour
-    from volcli.kernels.traversal import segment_buffer
 
     grid = scene.density
     interpolation = "nearest" if plan.nearest else "linear"
@@ -305,26 +306,9 @@ def make_integrator(
             grid.origin - source.origin,
             source.brightest,
         )
-
-    def integrate(origins: NDArray[Any], directions: NDArray[Any]) -> tuple[Any, ...]:
-        n = len(origins)
-        tau, light = np.zeros(n), np.zeros((n, 3))
-        distance = np.empty(n) if plan.depth else None
-        evaluations = integrate_rays(
-            origins,
-            directions,
-            density,
-            colour,
-            plan.step_voxels,
-            True if plan.nearest else None,
-            distance,
-            tau,
-            light,
-            segment_buffer(),
-        )
-        return tau, light, distance, int(evaluations)
-
-    return integrate
+    return integrator.make_integrator(
+        density, colour, step_voxels=plan.step_voxels, nearest=plan.nearest, depth=plan.depth
+    )
 
 
 def _check_step(grid: BrickGrid, plan: Plan) -> None:

@@ -50,8 +50,8 @@ class BrickArrays(NamedTuple):
     lower
         (l, 4096) int32: entries of bricks, index ``(x*16 + y)*16 + z``.
     occupied
-        (l, 64) bool: which of the 4^3 macro cells (4^3 bricks each) of a lower node hold anything
-        but background; index ``(x*4 + y)*4 + z``.
+        (l,) int64: which of the 4^3 macro cells (4^3 bricks each) of a lower node hold anything but
+        background: bit ``(x*4 + y)*4 + z``.
     upper
         (u, 32768) int32: entries of lower nodes, index ``(x*32 + y)*32 + z``.
     root_keys, root_entries
@@ -65,7 +65,7 @@ class BrickArrays(NamedTuple):
     atlas: NDArray[np.float32]
     constants: NDArray[np.float32]
     lower: NDArray[np.int32]
-    occupied: NDArray[np.bool_]
+    occupied: NDArray[np.int64]
     upper: NDArray[np.int32]
     root_keys: NDArray[np.int64]
     root_entries: NDArray[np.int32]

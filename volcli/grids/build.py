@@ -309,9 +309,9 @@ def _fill(
     return atlas.reshape(-1, APRON**3, *channels)
 
 
-def _occupied(lower: NDArray[np.int32]) -> NDArray[np.bool_]:
-    cells = (lower != BACKGROUND).reshape(-1, 4, 4, 4, 4, 4, 4)
-    return np.ascontiguousarray(cells.any(axis=(2, 4, 6)).reshape(-1, 64))
+def _occupied(lower: NDArray[np.int32]) -> NDArray[np.int64]:
+    cells = (lower != BACKGROUND).reshape(-1, 4, 4, 4, 4, 4, 4).any(axis=(2, 4, 6))
+    return np.packbits(cells.reshape(-1, 64), axis=1, bitorder="little").view("<i8").ravel()
 
 
 def _root_index(

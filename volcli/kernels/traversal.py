@@ -308,12 +308,12 @@ def root_segments(grid, skip_background, entry, corner, ray, t0, t1, buffer):
 @jit
 def block_segments(grid, skip_background, entry, x, y, z, ray, t0, t1, buffer):
     """As `root_segments`, for the occupied macro cells of the block with lowest voxel (x, y, z)."""
-    occupied = grid.occupied
+    occupied = grid.occupied[entry]
     i, j, k, tx, ty, tz, sx, sy, sz, ddx, ddy, ddz = start_all(ray, t0, x, y, z, float(MACRO), 4.0)
     t = t0
     while True:
         t_exit = min(min(tx, ty), min(tz, t1))
-        if t_exit > t and (occupied[entry, (i * 4 + j) * 4 + k] or not skip_background):
+        if t_exit > t and (not skip_background or occupied >> ((i * 4 + j) * 4 + k) & 1):
             macro_segments(grid, skip_background, entry, i, j, k, x, y, z, ray, t, t_exit, buffer)
         t = max(t, t_exit)
         if t_exit >= t1:

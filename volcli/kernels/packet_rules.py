@@ -1,0 +1,284 @@
+"""The rules of integration over the segments of a packet: `rules`, for `LANES` segments at once.
+
+A segment of a ray in one brick knows nothing of what lies before it, so segments of different rays
+and bricks stand side by side, in the order of `packets.sort_by_length`. What is found goes to the
+buffer, as if the ray began with the segment.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from volcli.kernels.cell import (
+    MAX_TAU,
+    SHORTEST,
+    absorbed,
+    antiderivative,
+    cubic,
+    hit_weights,
+    integral,
+    trilinear,
+)
+from volcli.kernels.compiler import jit
+from volcli.kernels.lane_memory import gather, gather_square, load, scatter
+from volcli.kernels.lanes import LANES, any_of, floats, ints, numbers, pick, to_floats, to_ints
+from volcli.kernels.packet_walk import enter_cube, make_rays, nearest_plane, unpack
+from volcli.kernels.source import FADED
+from volcli.kernels.traversal import BRICK
+
+CORNER_ROW, STEP_ROW, FAR_ROW, SPEED_ROW, TAU_ROW, MOMENT_ROW, RAY_ROWS = 9, 12, 13, 14, 15, 16, 17
+"""Numbers kept of each ray, a row of `LANES` for each: o, d and inverse come first (3 rows each),
+then the root cell's corner, the step of the midpoint rule, t_far, the planes crossed per world unit
+of distance, and the sums."""
+
+
+class Segments(NamedTuple):
+    """`LANES` segments, of any rays of the packet.
+
+    Attributes
+    ----------
+    here
+        MASK: which lanes have one.
+    place
+        INTS: where in the buffer they are.
+    rays
+        Their rays.
+    begin, end
+        FLOATS: from and to where.
+    brick
+        INTS: the brick; where negative, the constant ``-1 - brick``.
+    corner
+        (x, y, z) FLOATS: the brick's lowest local voxel.
+    step, t_far
+        FLOATS: length of a step of the midpoint rule, and where the ray leaves the volume.
+    """
+
+    here: Any
+    place: Any
+    rays: Any
+    begin: Any
+    end: Any
+    brick: Any
+    corner: Any
+    step: Any
+    t_far: Any
+
+
+class Sums(NamedTuple):
+    """What is known of segments up to some distance, all as if nothing were before them.
+
+    Attributes
+    ----------
+    tau, T, moment
+        FLOATS: as in `source.State`.
+    """
+
+    tau: Any
+    T: Any
+    moment: Any
+
+
+@jit
+def kept(buffer, row, ray, mask):
+    """A number that was put down, for each lane that of its own ray."""
+    return gather(buffer.rays, ray + row * LANES, mask)
+
+
+@jit
+def kept_vector(buffer, row, ray, mask):
+    """Three."""
+    return (
+        kept(buffer, row, ray, mask),
+        kept(buffer, row + 1, ray, mask),
+        kept(buffer, row + 2, ray, mask),
+    )
+
+
+@jit
+def fetch(buffer, first, total):
+    """`Segments` first to first + LANES, in sorted order."""
+    here = numbers() + first < total
+    place = pick(here, load(buffer.order, first), 0)
+    brick, (x, y, z), ray = unpack(gather(buffer.content, place, here))
+    rays = make_rays(
+        kept_vector(buffer, 0, ray, here),
+        kept_vector(buffer, 3, ray, here),
+        kept_vector(buffer, 6, ray, here),
+    )
+    root = kept_vector(buffer, CORNER_ROW, ray, here)
+    corner = (
+        root[0] + to_floats(x) * float(BRICK),
+        root[1] + to_floats(y) * float(BRICK),
+        root[2] + to_floats(z) * float(BRICK),
+    )
+    return Segments(
+        here,
+        place,
+        rays,
+        gather(buffer.begin, place, here),
+        gather(buffer.end, place, here),
+        brick,
+        corner,
+        kept(buffer, STEP_ROW, ray, here),
+        kept(buffer, FAR_ROW, ray, here),
+    )
+
+
+@jit
+def corners(atlas, at, mask):
+    """The eight values about cells that begin at ``at`` in the atlas: `cell.load`."""
+    return gather_square(atlas, at, 9, mask) + gather_square(atlas, at + 81, 9, mask)
+
+
+@jit
+def add_cells(sums, p, scale, t, t_exit, mask, depth, t_far):
+    """Add [t, t_exit] to the sums; p is the density's cubic about the middle.
+
+    Without depth only the optical depth is added; else see `source.add_span`, of which this is
+    the same for lanes. Light has faded (`source.faded`) where it has within the segment alone: then
+    it has in the ray.
+    """
+    if depth is None:
+        tau = sums.tau + scale * integral(p, max(t_exit - t, 0.0))
+        return Sums(pick(mask, tau, sums.tau), sums.T, sums.moment)
+    tm = 0.5 * (t + t_exit)
+    u, end = t - tm, t_exit - tm
+    begin = antiderivative(p, u)
+    whole = max(0.0, scale * (antiderivative(p, end) - begin))
+    T, moment = sums.T, sums.moment
+    length = end - u
+    shortest = length * SHORTEST
+    left = mask & (whole > 0.0) & (T * t_far > FADED * moment)
+    while any_of(left):
+        to = min(u + length, end)
+        thick = scale * (antiderivative(p, to) - begin) > MAX_TAU
+        halve = left & thick & (length > shortest)
+        take = left & ~halve
+        part, at, w = hit_weights(p, scale, u, to)
+        hit = T * absorbed(part)
+        mean = at[0] * w[0] + at[1] * w[1] + at[2] * w[2] + at[3] * w[3]
+        moment = pick(take, moment + hit * (tm + mean), moment)
+        T = pick(take, T - hit, T)
+        u = pick(take, to, u)
+        begin = antiderivative(p, u)
+        length = pick(take, length * 2.0, pick(halve, length * 0.5, length))
+        left = left & (u < end) & (T * t_far > FADED * moment)
+    return Sums(pick(mask, sums.tau + whole, sums.tau), T, moment)
+
+
+@jit
+def exact_segments(grid, scale, nearest, depth, buffer, total):
+    """The exact rule on the first ``total`` segments in sorted order; returns cells, INTS."""
+    evaluated = ints(0)
+    for first in range(0, total, LANES):
+        seg = fetch(buffer, first, total)
+        o, d = seg.rays.o, seg.rays.d
+        sums = Sums(floats(0.0), floats(1.0), floats(0.0))
+        t, t1 = seg.begin, seg.end
+        zero = floats(0.0)
+
+        constant = seg.here & (seg.brick < 0)
+        if any_of(constant):
+            value = gather(grid.constants, -1 - seg.brick, constant)
+            sums = add_cells(
+                sums, (value, zero, zero, zero), scale, t, t1, constant, depth, seg.t_far
+            )
+            evaluated = pick(constant, evaluated + 1, evaluated)
+
+        active = seg.here & ~constant & (t < t1)
+        walk = enter_cube(seg.rays, t, seg.corner, 1.0, 8.0)
+        i, j, k = to_ints(walk.cell[0]), to_ints(walk.cell[1]), to_ints(walk.cell[2])
+        x, y, z = seg.corner
+        x, y, z = x + walk.cell[0], y + walk.cell[1], z + walk.cell[2]
+        # One number for where the cell is: low, its place in the brick; high, i, j and k, a byte
+        # each, whose fourth bit is set as soon as one is not in 0 to 7.
+        cell = (i << 32) + (j << 40) + (k << 48) + ((i * 9 + j) * 9 + k)
+        step_x = to_ints(walk.step[0]) * ((1 << 32) + 81)
+        step_y = to_ints(walk.step[1]) * ((1 << 40) + 9)
+        step_z = to_ints(walk.step[2]) * ((1 << 48) + 1)
+        outside = (8 << 32) + (8 << 40) + (8 << 48)
+        tx, ty, tz = walk.planes
+        while any_of(active):
+            t_exit = min(min(tx, ty), min(tz, t1))
+            at = seg.brick * 729 + (cell & 0xFFFF)
+            if nearest is not None:
+                p = (gather(grid.atlas, at, active), zero, zero, zero)
+            else:
+                tm = 0.5 * (t + t_exit)
+                p = cubic(
+                    corners(grid.atlas, at, active),
+                    o[0] + tm * d[0] - x,
+                    o[1] + tm * d[1] - y,
+                    o[2] + tm * d[2] - z,
+                    d[0],
+                    d[1],
+                    d[2],
+                )
+            met = active & (t_exit > t)
+            sums = add_cells(sums, p, scale, t, t_exit, met, depth, seg.t_far)
+            evaluated = pick(met, evaluated + 1, evaluated)
+            t = max(t, t_exit)
+            over_x, over_y, over_z = nearest_plane((tx, ty, tz))
+            tx = pick(over_x, tx + walk.spacing[0], tx)
+            ty = pick(over_y, ty + walk.spacing[1], ty)
+            tz = pick(over_z, tz + walk.spacing[2], tz)
+            x = pick(over_x, x + walk.step[0], x)
+            y = pick(over_y, y + walk.step[1], y)
+            z = pick(over_z, z + walk.step[2], z)
+            cell = cell + pick(over_x, step_x, pick(over_y, step_y, step_z))
+            active = active & (t_exit < t1) & ((cell & outside) == 0)
+        scatter(buffer.tau, seg.place, sums.tau, seg.here)
+        if depth is not None:
+            scatter(buffer.moment, seg.place, sums.moment, seg.here)
+    return evaluated
+
+
+@jit
+def density_at(grid, seg, nearest, t, mask):
+    """The density at distance t in each segment: `rules.density_at`."""
+    x = seg.rays.o[0] + t * seg.rays.d[0] - seg.corner[0]
+    y = seg.rays.o[1] + t * seg.rays.d[1] - seg.corner[1]
+    z = seg.rays.o[2] + t * seg.rays.d[2] - seg.corner[2]
+    i = min(max(math.floor(x), 0.0), 7.0)
+    j = min(max(math.floor(y), 0.0), 7.0)
+    k = min(max(math.floor(z), 0.0), 7.0)
+    solid = seg.brick < 0
+    at = seg.brick * 729 + to_ints((i * 9.0 + j) * 9.0 + k)
+    inside = mask & ~solid
+    if nearest is not None:
+        value = gather(grid.atlas, at, inside)
+    else:
+        value = max(0.0, trilinear(corners(grid.atlas, at, inside), x - i, y - j, z - k))
+    return pick(solid, gather(grid.constants, -1 - seg.brick, mask & solid), value)
+
+
+@jit
+def midpoint_segments(grid, scale, nearest, depth, buffer, total):
+    """The midpoint rule on sorted segments (`rules.midpoint_segment`); returns samples, INTS."""
+    evaluated = ints(0)
+    for first in range(0, total, LANES):
+        seg = fetch(buffer, first, total)
+        step, t_far = seg.step, seg.t_far
+        last = max(-math.floor(-t_far / step) - 1.0, 0.0)
+        n = min(max(-math.floor(0.5 - seg.begin / step) - 1.0, 0.0), last)
+        tau, T, moment = floats(0.0), floats(1.0), floats(0.0)
+        active = seg.here
+        while any_of(active):
+            length = min(step, t_far - n * step)
+            t = n * step + 0.5 * length
+            active = active & (t < seg.end)
+            met = active & (t >= seg.begin)
+            part = scale * density_at(grid, seg, nearest, t, met) * length
+            tau = pick(met, tau + part, tau)
+            if depth is not None:
+                hit = T * absorbed(part)
+                moment = pick(met, moment + hit * t, moment)
+                T = pick(met, T - hit, T)
+            evaluated = pick(met, evaluated + 1, evaluated)
+            n = n + 1.0
+            active = active & (n <= last)
+        scatter(buffer.tau, seg.place, tau, seg.here)
+        if depth is not None:
+            scatter(buffer.moment, seg.place, moment, seg.here)
+    return evaluated

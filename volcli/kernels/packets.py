@@ -1,0 +1,230 @@
+"""The loop over packets of rays: `rays`, for scenes without a colour grid, `LANES` rays at once.
+
+A segment of a ray in one brick knows nothing of what lies before it: transmittance is
+multiplicative. So a packet takes three passes. `packet_walk` lists the segments of its rays; they
+are integrated side by side, a segment a lane, sorted by length so that the lanes finish together;
+and each ray is put together from its segments, front to back. What happens in a cell is `cell`'s,
+for a register as for a scalar.
+
+A ray's result depends on nothing but the ray: neither on its packet nor on the order of segments.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from volcli.kernels.cell import absorbed
+from volcli.kernels.compiler import jit, kernel
+from volcli.kernels.lane_memory import gather, load, scatter, store
+from volcli.kernels.lanes import LANES, any_of, floats, ints, numbers, pick, to_ints
+from volcli.kernels.packet_rules import (
+    CORNER_ROW,
+    FAR_ROW,
+    MOMENT_ROW,
+    RAY_ROWS,
+    SPEED_ROW,
+    STEP_ROW,
+    TAU_ROW,
+    exact_segments,
+    kept,
+    midpoint_segments,
+)
+from volcli.kernels.packet_walk import (
+    ROOM,
+    Buffer,
+    absolute,
+    clip_axis,
+    enter,
+    make_rays,
+    root_cell,
+    root_next,
+    root_planes,
+    root_segments,
+)
+
+BINS = 32
+"""Lengths that the sort tells apart: a segment has at most 3 * (8 - 1) + 1 = 22 cells."""
+
+
+def packet_buffer() -> Buffer:
+    """An empty `Buffer`."""
+    return Buffer(
+        begin=np.empty(ROOM),
+        end=np.empty(ROOM),
+        content=np.empty(ROOM, np.int64),
+        tau=np.empty(ROOM),
+        moment=np.empty(ROOM),
+        key=np.empty(ROOM, np.int8),
+        order=np.empty(ROOM, np.int32),
+        rays=np.empty(RAY_ROWS * LANES),
+        bins=np.empty(BINS + 1, np.int64),
+    )
+
+
+@jit
+def keep(buffer, row, values):
+    """Put down a number of each ray."""
+    store(buffer.rays, row * LANES, values)
+
+
+@jit
+def keep_vector(buffer, row, vector):
+    """Put down three."""
+    keep(buffer, row, vector[0])
+    keep(buffer, row + 1, vector[1])
+    keep(buffer, row + 2, vector[2])
+
+
+@jit
+def sort_by_length(buffer, total):
+    """Sort the segments by the number of cells that they cross, about."""
+    for first in range(0, total, LANES):
+        ray = load(buffer.content, first) & (LANES - 1)
+        speed = kept(buffer, SPEED_ROW, ray, numbers() + first < total)
+        cells = (load(buffer.end, first) - load(buffer.begin, first)) * speed
+        store(buffer.key, first, to_ints(min(max(cells, 0.0), BINS - 1.0)))
+    bins = buffer.bins
+    for b in range(BINS + 1):
+        bins[b] = 0
+    for n in range(total):
+        bins[buffer.key[n] + 1] += 1
+    for b in range(BINS):
+        bins[b + 1] += bins[b]
+    for n in range(total):
+        key = buffer.key[n]
+        buffer.order[bins[key]] = n
+        bins[key] += 1
+
+
+@jit
+def compose(buffer, total, depth):
+    """Put the segments behind what is known of their rays, front to back."""
+    sums = buffer.rays
+    for n in range(total):
+        at = TAU_ROW * LANES + (buffer.content[n] & (LANES - 1))
+        tau = sums[at]
+        sums[at] = tau + buffer.tau[n]
+        if depth is not None:
+            buffer.tau[n] = tau  # what lies before the segment
+    if depth is not None:
+        for first in range(0, total, LANES):
+            before = math.exp(-load(buffer.tau, first))
+            store(buffer.moment, first, before * load(buffer.moment, first))
+        for n in range(total):
+            sums[MOMENT_ROW * LANES + (buffer.content[n] & (LANES - 1))] += buffer.moment[n]
+
+
+@jit
+def to_local(m, vectors, row, mask, w):
+    """`rays.to_local`, for each lane its own row."""
+    x = gather(vectors, row * 3, mask)
+    y = gather(vectors, row * 3 + 1, mask)
+    z = gather(vectors, row * 3 + 2, mask)
+    return (
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] * w,
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] * w,
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] * w,
+    )
+
+
+@jit
+def packet(rays, t_far, alive, density, step, nearest, depth, skip_background, buffer):
+    """Integrate the rays of a packet, from where they enter the volume; returns cells, INTS.
+
+    What becomes of them stands in the buffer's rows of sums.
+    """
+    grid = density.grid
+    evaluated = ints(0)
+    keep_vector(buffer, 0, rays.o)
+    keep_vector(buffer, 3, rays.d)
+    keep_vector(buffer, 6, rays.inverse)
+    keep(buffer, FAR_ROW, t_far)
+    speed = absolute(rays.d[0]) + absolute(rays.d[1]) + absolute(rays.d[2])
+    keep(buffer, SPEED_ROW, speed)
+    keep(buffer, STEP_ROW, speed if step is None else step)
+    keep(buffer, TAU_ROW, floats(0.0))
+    keep(buffer, MOMENT_ROW, floats(0.0))
+    at = enter(grid, rays, alive)
+    t = floats(0.0)
+    while any_of(alive):
+        planes = root_planes(grid, rays, at, alive)
+        t_exit = min(min(planes[0], planes[1]), min(planes[2], t_far))
+        entry, corner = root_cell(grid, at, alive)
+        met = alive & (t_exit > t)
+        total = root_segments(grid, skip_background, rays, entry, corner, t, t_exit, met, buffer)
+        if total > 0:
+            keep_vector(buffer, CORNER_ROW, corner)
+            sort_by_length(buffer, total)
+            if step is not None:
+                cells = midpoint_segments(grid, density.scale, nearest, depth, buffer, total)
+            else:
+                cells = exact_segments(grid, density.scale, nearest, depth, buffer, total)
+            evaluated = evaluated + cells
+            compose(buffer, total, depth)
+        t = max(t, t_exit)
+        at, known = root_next(grid, rays, at, planes)
+        alive = alive & known & (t < t_far)
+    return evaluated
+
+
+@kernel
+def integrate_packets(
+    origins, directions, density, step_voxels, nearest, depth, optical_depth, buffer
+):
+    """Integrate a batch of rays; parameters and result are those of `rays.integrate_rays`.
+
+    ``buffer`` is a `packet_buffer`.
+    """
+    skip_background = density.grid.constants[0] == 0.0
+    m, box = density.local_from_world, density.support
+    shift = 0.0 if nearest is None else 0.5
+    evaluated = ints(0)
+    for first in range(0, len(origins), LANES):
+        row = numbers() + first
+        here = row < len(origins)
+        eye = to_local(m, origins, row, here, 1.0)
+        d = to_local(m, directions, row, here, 0.0)
+        t_near, t_far = floats(0.0), floats(math.inf)
+        t_near, t_far = clip_axis(box[0, 0], box[1, 0], eye[0], d[0], t_near, t_far)
+        t_near, t_far = clip_axis(box[0, 1], box[1, 1], eye[1], d[1], t_near, t_far)
+        t_near, t_far = clip_axis(box[0, 2], box[1, 2], eye[2], d[2], t_near, t_far)
+        alive = here & (t_near < t_far)
+        tau, distance = floats(0.0), floats(math.inf)
+        if any_of(alive):
+            t_near = pick(alive, t_near, 0.0)
+            start = (
+                eye[0] + t_near * d[0] + shift,
+                eye[1] + t_near * d[1] + shift,
+                eye[2] + t_near * d[2] + shift,
+            )
+            rays = make_rays(start, d, (1.0 / d[0], 1.0 / d[1], 1.0 / d[2]))
+            step = None
+            if step_voxels is not None:
+                step = step_voxels / math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+            evaluated = evaluated + packet(
+                rays,
+                t_far - t_near,
+                alive,
+                density,
+                step,
+                nearest,
+                depth,
+                skip_background,
+                buffer,
+            )
+            tau = load(buffer.rays, TAU_ROW * LANES)
+            if depth is not None:
+                hit = absorbed(tau)
+                some = hit > 0.0
+                moment = load(buffer.rays, MOMENT_ROW * LANES)
+                distance = pick(some, t_near + moment / pick(some, hit, 1.0), distance)
+        scatter(optical_depth, row, tau, here)
+        if depth is not None:
+            scatter(depth, row, distance, here)
+    store(buffer.content, 0, evaluated)
+    cells = 0
+    for lane in range(LANES):
+        cells += buffer.content[lane]
+    return cells
