@@ -52,6 +52,19 @@ gallery-elsewhere: $(SETUP)
 	    --set density.file=$(VOLUMES)/oiio_sphere.vdb --set color.file=$(VOLUMES)/oiio_sphere_Cd.vdb
 	$(BIN)/python docs/strip_headers.py docs/gallery/*.png
 
+# The README's pictures of opacity; that of the page needs a browser (Debian: apt-get install chromium).
+VIEW := --color-grid Cd --density-scale 0.5 --size 720x540 --eye 0,1.9,8.6 --target 0,2.1,0
+gallery-opacity: $(SETUP)
+	mkdir -p out
+	$(BIN)/volcli render samples/cloud.vdb $(VIEW) -o out/cloud.exr
+	$(BIN)/volcli render samples/cloud.vdb $(VIEW) -o out/cloud-step6.exr --step 6
+	$(BIN)/volcli inspect out/cloud.exr out/cloud-step6.exr --html out/page.html
+	$(BIN)/python docs/page_picture.py out/page.html docs/page.png '#layer=opacity&wipe=0.5&line=1&iso=0.5'
+	$(BIN)/volcli inspect out/cloud.exr --heatmap docs/heatmap.png --contours 0.2,0.5,0.8
+	$(BIN)/volcli probe samples/explosion.vdb --density-scale 2 --color-grid Cd --pixel 400,300 \
+	    --step 2 --step 8 --plot docs/probe.png
+	$(BIN)/python docs/strip_headers.py docs/page.png docs/heatmap.png docs/probe.png
+
 # Needs the real OpenVDB library (Debian: apt-get install python3-openvdb).
 samples:
 	/usr/bin/python3 samples/make_samples.py samples

@@ -45,6 +45,9 @@ def test_each_command_of_the_readme_does_what_the_text_beside_it_says(command, c
     words = shlex.split(command)[1:]
     if words[0] == "render":  # small: what is tested is that it runs, not the picture
         words += ["--size", "64x48"]
+    else:  # pictures that an earlier example made
+        for name in (word for word in words[1:] if word.endswith(".exr")):
+            volcli("render", "samples/cloud.vdb", "-o", name, "--size", "64x48")
     ran = volcli(*words)
     assert ran.code == 0, ran.err
     if "-o" in words:
@@ -52,6 +55,9 @@ def test_each_command_of_the_readme_does_what_the_text_beside_it_says(command, c
         if "camera.frame=all" in words:
             written = written.with_name(f"{written.stem}.0002{written.suffix}")
         assert written.stat().st_size > 0
+    for flag in ("--heatmap", "--html", "--plot", "--csv", "--difference"):
+        if flag in words:
+            assert (checkout / words[words.index(flag) + 1]).stat().st_size > 0
     if "--maps" in words:
         for name in words[words.index("--maps") + 1].split(","):
             assert written.with_suffix(f".{name}.png").stat().st_size > 0

@@ -107,11 +107,10 @@ def _draw_light(axes: Any, walked: Walk, t: Any) -> None:
     through = np.exp(-_tau_at(walked, t))
     axes.plot(t, through * walked.sigma(t), color="0.15", linewidth=1.2, label="T sigma")
     axes.set_ylim(bottom=0)
-    axes.legend(loc="best", fontsize=8)
     seen = axes.twinx()
     total = np.cumsum(walked.light, axis=0)
     for c, (name, color) in enumerate(_CHANNELS.items()):
         style = ("-", "--", ":")[c]  # told apart without colours as well
         seen.plot(walked.end, total[:, c], color=color, linestyle=style, linewidth=1.2, label=name)
     seen.set_ylabel("radiance so far")
-    seen.legend(loc="center right", fontsize=8)
+    seen.legend(handles=[*axes.get_lines(), *seen.get_lines()], loc="center right", fontsize=8)
