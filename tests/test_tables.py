@@ -57,7 +57,7 @@ def test_the_ends_of_a_map_are_those_of_the_active_values_where_there_is_no_rang
 
 def test_a_map_without_a_name_is_inferno():
     table = ramp_table(Ramp(), (0.0, 1.0), "color.ramp", "a")
-    np.testing.assert_array_equal(table.colors, map_colors("inferno", "color.ramp"))
+    np.testing.assert_array_equal(table.colors, map_colors("inferno", "color.ramp.map"))
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_a_map_without_a_name_is_inferno():
 )
 def test_a_map_that_there_is_not_is_refused_with_a_guess(name, meant):
     with pytest.raises(UsageError, match=f"color.ramp.map: no colour map '{name}'.*{meant}"):
-        map_colors(name, "color.ramp")
+        map_colors(name, "color.ramp.map")
 
 
 def test_a_grid_of_one_value_has_no_range():

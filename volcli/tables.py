@@ -105,7 +105,7 @@ def check_maps(job: Job) -> None:
     """Raise the `UsageError` of a colour map that there is not, before anything is read."""
     for name, part in (("color", job.color), ("emission", job.emission)):
         if part.ramp is not None and part.ramp.stops is None:
-            map_colors(part.ramp.map or DEFAULT_MAP, f"{name}.ramp")
+            map_colors(part.ramp.map or DEFAULT_MAP, f"{name}.ramp.map")
 
 
 def transfer_table(ramp: DensityRamp) -> TransferTable:
@@ -150,11 +150,17 @@ def ramp_table(ramp: Ramp, active: Range, key: str, where: str) -> ColorTable:
             f"{where}: is {low:g} wherever it is active, which is no range for a colour map; give "
             f"{key}.range"
         )
-    return ColorTable(np.linspace(low, high, MAP_KNOTS), map_colors(ramp.map or DEFAULT_MAP, key))
+    colors = map_colors(ramp.map or DEFAULT_MAP, f"{key}.map")
+    return ColorTable(np.linspace(low, high, MAP_KNOTS), colors)
 
 
-def map_colors(name: str, key: str) -> NDArray[np.float64]:
+def map_colors(name: str, where: str) -> NDArray[np.float64]:
     """(256, 3): one of matplotlib's colour maps in linear light, from its first colour to its last.
+
+    Parameters
+    ----------
+    where
+        Who asks for it, for the message: ``color.ramp.map``, ``--colormap``.
 
     Raises
     ------
@@ -171,7 +177,7 @@ def map_colors(name: str, key: str) -> NDArray[np.float64]:
             if close
             else ", such as viridis, inferno or coolwarm"
         )
-        raise UsageError(f"{key}.map: no colour map '{name}' in matplotlib{meant}")
+        raise UsageError(f"{where}: no colour map '{name}' in matplotlib{meant}")
     shown = colormaps[name](np.linspace(0.0, 1.0, MAP_KNOTS))[:, :3]
     return linear_from_srgb(shown)
 

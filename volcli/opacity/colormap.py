@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
-
 import numpy as np
 from numpy.typing import NDArray
 
-from volcli.errors import UsageError
-
-DEFAULT = "viridis"
+from volcli.srgb import srgb_from_linear
+from volcli.tables import map_colors
 
 DECADES = 6
 """A logarithmic scale goes down to this many powers of ten below its largest value."""
@@ -21,18 +18,10 @@ def shades(name: str) -> NDArray[np.uint8]:
     Raises
     ------
     UsageError
-        There is no such map; suggests one.
+        matplotlib has no such map; suggests one.
     """
-    from matplotlib import colormaps
-
-    if name not in colormaps:
-        known = {other.lower(): other for other in colormaps}
-        close = difflib.get_close_matches(name.lower(), known, n=1)
-        meant = f"did you mean '{known[close[0]]}'?" if close else "such as viridis, magma, gray"
-        raise UsageError(f"--colormap {name}: matplotlib has no such colour map; {meant}")
-    colours = colormaps[name]
-    entries = np.rint(np.linspace(0, colours.N - 1, 256)).astype(int)  # a map of 256 as it is
-    return np.asarray(colours(entries, bytes=True)[:, :3], np.uint8)
+    linear = map_colors(name, "--colormap")
+    return np.rint(255 * srgb_from_linear(linear)).astype(np.uint8)
 
 
 def limits(name: str, values: NDArray[np.float32], logarithmic: bool) -> tuple[float, float]:
