@@ -13,6 +13,7 @@ import os
 import queue
 import secrets
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable
@@ -43,7 +44,9 @@ class Farm:
     address
         Of a scheduler; None: a cluster of ``count`` workers on this machine.
     on_start
-        Called with the process id of each worker of this machine's cluster.
+        Called with the process id of each worker that is on this machine.
+    note
+        Called with what the user should know.
 
     Raises
     ------
@@ -52,15 +55,19 @@ class Farm:
     """
 
     def __init__(
-        self, address: str | None, count: int, limits: Limits, on_start: Callable[[int], None]
+        self,
+        address: str | None,
+        count: int,
+        limits: Limits,
+        on_start: Callable[[int], None],
+        note: Callable[[str], None] = lambda text: None,
     ) -> None:
         if not is_installed():
             raise UsageError("--scheduler needs dask.distributed: pip install 'volcli[farm]'")
         from distributed import Client
 
-        # What it has to say of workers that die, and of ends, is told in outcomes and errors.
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)
-        self._limits, self._on_start = limits, on_start
+        _silence()
+        self._limits, self._on_start, self._note = limits, on_start, note
         self._cluster = _cluster(count, limits) if address is None else None
         self._name = address or "the local cluster"
         try:
@@ -80,7 +87,7 @@ class Farm:
         self._numbers = itertools.count()
         self._batch = secrets.token_hex(4)
         self._workers: set[str] = set()
-        self._looked = 0.0
+        self._looked, self._has_looked = 0.0, False
         self._pids: set[int] = set()
         self._look()
 
@@ -136,8 +143,7 @@ class Farm:
                 outcome: Outcome = future.result()
             except Exception as error:  # it was computed, and lost before it was fetched
                 return Outcome(key, f"its result was lost ({_line(error)})", lost=not alone)
-            if self._cluster is not None:
-                self._seen(outcome.pid)
+            self._seen(outcome.host, outcome.pid)
             return outcome
         if future.status in ("cancelled", "lost"):
             raise self._gone()
@@ -149,20 +155,22 @@ class Farm:
 
     def _look(self) -> None:
         """Which workers there are; asked again once a while."""
-        if time.monotonic() - self._looked < _LOOK_SECONDS and self._workers:
+        if self._has_looked and time.monotonic() - self._looked < _LOOK_SECONDS:
             return
         self._looked = time.monotonic()
         try:
             workers = set(self._client.nthreads())
-            if self._cluster is not None and workers != self._workers:
-                for pid in self._client.run(os.getpid, on_error="ignore").values():
-                    self._seen(pid)
+            if workers - self._workers:
+                for host, pid in self._client.run(_whoami, on_error="ignore").values():
+                    self._seen(host, pid)
         except (OSError, TimeoutError, ValueError) as error:
             raise self._gone() from error
-        self._workers = workers
+        if not workers and (self._workers or not self._has_looked):
+            self._note(f"{self._name}: has no workers; waiting for some")
+        self._workers, self._has_looked = workers, True
 
-    def _seen(self, pid: int) -> None:
-        if pid not in self._pids:
+    def _seen(self, host: str, pid: int) -> None:
+        if host == socket.gethostname() and pid not in self._pids:
             self._pids.add(pid)
             self._on_start(pid)
 
@@ -189,6 +197,18 @@ def _cluster(count: int, limits: Limits) -> Any:
             security=Security.temporary(),
             silence_logs=logging.CRITICAL,
         )
+
+
+def _silence() -> None:
+    """Keep distributed's logs off the terminal: what they tell comes as outcomes and errors too."""
+    names = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
+    for name in ("distributed", *names):
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+
+
+def _whoami() -> tuple[str, int]:
+    """On a worker: its machine and its process id."""
+    return socket.gethostname(), os.getpid()
 
 
 def _ignore_interrupts() -> None:

@@ -29,7 +29,6 @@ import volcli
 from volcli.batch.identity import is_as_printed
 from volcli.errors import OutputError
 
-
 _START = b'{"event": '
 
 

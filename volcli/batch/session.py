@@ -111,6 +111,7 @@ def run_batch(
     tell: Callable[[Told], None],
     advance: Callable[[int], None] = lambda count: None,
     begin: Callable[[Tally], None] = lambda tally: None,
+    note: Callable[[str], None] = lambda text: None,
 ) -> None:
     """Run a batch; ``tally`` says what became of it, also where it is interrupted.
 
@@ -120,6 +121,8 @@ def run_batch(
         Called with what becomes of each job, and with the number of tasks that are settled.
     begin
         Called once it is known what is to do.
+    note
+        Called with what the user should know.
 
     Raises
     ------
@@ -173,7 +176,7 @@ def run_batch(
                 folder.mkdir(parents=True, exist_ok=True)
         try:
             for count, share in _phases(works, _workers(options, len(works)), memory, options):
-                engine = _engine(options, count, memory, started)
+                engine = _engine(options, count, memory, started, note)
                 try:
                     Runner(engine, manifest, options.settings, keep, advance).run(share)
                 finally:
@@ -251,10 +254,11 @@ def _engine(
     count: int,
     memory: int,
     started: Callable[[int], None],
+    note: Callable[[str], None],
 ) -> Engine:
     if options.scheduler is not None:
         limits = Limits(options.threads, None, options.cache)
-        return farm.Farm(options.scheduler, count, limits, started)
+        return farm.Farm(options.scheduler, count, limits, started, note)
     threads = options.threads or max(1, available_threads() // count)
     limits = Limits(threads, memory // count, options.cache)
     if farm.is_installed():

@@ -156,7 +156,9 @@ def batch(
         for note in expanded.notes:
             output.note(note)
         try:
-            run_batch(expanded, options, tally, output.tell, output.advance, output.begin)
+            run_batch(
+                expanded, options, tally, output.tell, output.advance, output.begin, output.note
+            )
         finally:
             output.summary(expanded.manifest)
         if contact_sheet is not None:
