@@ -80,9 +80,7 @@ def probe(
         raise UsageError("which ray: give --pixel X,Y, or --ray OX,OY,OZ,DX,DY,DZ")
     if any(not (0 < s < math.inf) for s in step or []):
         raise UsageError("--step: must be above 0")
-    job = options.job_of(
-        source,
-        settings,
+    flags = options.scene_flags(
         grid=grid,
         density_scale=density_scale,
         color=color,
@@ -95,6 +93,7 @@ def probe(
         image_size=image_size,
         interpolation=interpolation,
     )
+    job = options.job_of(source, flags, settings or [])
     from volcli.images import check_output
     from volcli.probe.rays import probe_job
     from volcli.probe.report import as_csv

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from volcli.cli import scene as options
 from volcli.cli.options import background as parse_background
-from volcli.cli.options import names, numbers, option, size
+from volcli.cli.options import names, option
 from volcli.cli.progress import Bars
 from volcli.cli.table import in_bytes, say, table, terminal_width
-from volcli.errors import BatchError, UsageError, VolcliError
+from volcli.errors import BatchError, VolcliError
 
 if TYPE_CHECKING:
     from volcli.plan import Plan, Term
@@ -29,23 +30,18 @@ def render(
         Path, typer.Argument(help="A volume (.vdb, .npy, .npz) or a job file (.toml).")
     ],
     output: Annotated[Path | None, option("output.image", "-o", "--output", metavar="OUT")] = None,
-    grid: Annotated[str | None, option("density.grid", "--grid", metavar="NAME")] = None,
-    density_scale: Annotated[
-        float | None, option("density.scale", "--density-scale", metavar="F")
-    ] = None,
-    color: Annotated[str | None, option("color.constant", "--color", metavar="R,G,B")] = None,
-    color_grid: Annotated[str | None, option("color.grid", "--color-grid", metavar="NAME")] = None,
-    eye: Annotated[str | None, option("camera.eye", "--eye", metavar="X,Y,Z")] = None,
-    target: Annotated[str | None, option("camera.target", "--target", metavar="X,Y,Z")] = None,
-    up: Annotated[str | None, option("camera.up", "--up", metavar="X,Y,Z")] = None,
-    fov: Annotated[float | None, option("camera.fov", "--fov", metavar="DEG")] = None,
-    ortho: Annotated[float | None, option("camera.width", "--ortho", metavar="WIDTH")] = None,
-    image_size: Annotated[str | None, option("camera.resolution", "--size", metavar="WxH")] = None,
+    grid: options.Grid = None,
+    density_scale: options.DensityScale = None,
+    color: options.Color = None,
+    color_grid: options.ColorGrid = None,
+    eye: options.Eye = None,
+    target: options.Target = None,
+    up: options.Up = None,
+    fov: options.Fov = None,
+    ortho: options.Ortho = None,
+    image_size: options.Size = None,
     step: Annotated[float | None, option("quadrature.step", "--step", metavar="VOXELS")] = None,
-    interpolation: Annotated[
-        str | None,
-        option("density.interpolation", "--interpolation", metavar="linear|nearest"),
-    ] = None,
+    interpolation: options.Interpolation = None,
     background: Annotated[
         str | None,
         typer.Option(
@@ -59,15 +55,7 @@ def render(
     reader: Annotated[
         str | None, option("density.reader", "--reader", metavar="volcli|openvdb")
     ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="Any field of the job, such as density.nonfinite=zero; repeatable. No VALUE: the "
-            "default.",
-        ),
-    ] = None,
+    settings: options.Settings = None,
     frames: Annotated[
         str | None,
         typer.Option(
@@ -109,39 +97,35 @@ def render(
     An EXR also holds its opacity, transmittance, optical depth and depth. Flags win over a job
     file, which wins over defaults. Without a camera the volume is framed.
     """
-    if color is not None and color_grid is not None:
-        raise UsageError("--color and --color-grid exclude each other; give one")
-    if fov is not None and ortho is not None:
-        raise UsageError("--fov and --ortho exclude each other; give one")
-    lens = "perspective" if fov is not None else "orthographic" if ortho is not None else None
-    flags: list[tuple[str, str, Any, Any]] = [
+    flags = options.scene_flags(
+        grid=grid,
+        density_scale=density_scale,
+        color=color,
+        color_grid=color_grid,
+        eye=eye,
+        target=target,
+        up=up,
+        fov=fov,
+        ortho=ortho,
+        image_size=image_size,
+        interpolation=interpolation,
+    )
+    flags += [
         ("output.image", "-o", output, output),
-        ("density.grid", "--grid", grid, grid),
-        ("density.scale", "--density-scale", density_scale, density_scale),
-        ("color.constant", "--color", color, numbers("--color", color)),
-        ("color.grid", "--color-grid", color_grid, color_grid),
-        ("camera.eye", "--eye", eye, numbers("--eye", eye)),
-        ("camera.target", "--target", target, numbers("--target", target)),
-        ("camera.up", "--up", up, numbers("--up", up)),
-        ("camera.type", "--fov or --ortho", lens, lens),
-        ("camera.fov", "--fov", fov, fov),
-        ("camera.width", "--ortho", ortho, ortho),
-        ("camera.resolution", "--size", image_size, size(image_size)),
         ("quadrature.rule", "--step", step, None if step is None else "midpoint"),
         ("quadrature.step", "--step", step, step),
-        ("density.interpolation", "--interpolation", interpolation, interpolation),
         ("output.maps", "--maps", maps, names(maps)),
         ("output.bits", "--bits", bits, bits),
         ("density.reader", "--reader", reader, reader),
     ]
     behind = parse_background(background)
-    spelled = {key: f"{flag} {_typed(text)}" for key, flag, text, _ in flags if text is not None}
+    spelled = options.spellings_of(flags)
     spelled |= {key: f"--background {background}" for key, _ in behind}
     from volcli.config import load_job
 
     job = load_job(
         source,
-        flags=[*((key, value) for key, _, _, value in flags if value is not None), *behind],
+        flags=[*options.values_of(flags), *behind],
         settings=settings or [],
         spelled=spelled,
     )
@@ -220,11 +204,6 @@ def _render(
                 say(json.dumps(printed, allow_nan=False))
             else:
                 say(_summary(report))
-
-
-def _typed(value: Any) -> str:
-    """A value about as it was typed: 0 rather than 0.0."""
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _warn(warnings: Sequence[str]) -> None:

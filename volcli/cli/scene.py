@@ -1,18 +1,21 @@
-"""The options that say what is looked at and from where, for commands that write no picture.
+"""The options that say what is seen and from where, which `render` and `probe` have in common.
 
-An EXR or a PNG of volcli's is a source as well: its header holds the job that made it.
+To `probe` a picture of volcli's is a source as well: its header holds the job that made it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from volcli.cli.options import numbers, option, size
 from volcli.errors import UsageError
+
+if TYPE_CHECKING:
+    from volcli.schema import Job
 
 Grid = Annotated[str | None, option("density.grid", "--grid", metavar="NAME")]
 DensityScale = Annotated[float | None, option("density.scale", "--density-scale", metavar="F")]
@@ -40,35 +43,37 @@ Settings = Annotated[
 PICTURES = (".exr", ".png")
 
 
-def job_of(
-    source: Path,
-    settings: Sequence[str] | None,
+Flag = tuple[str, str, Any, Any]
+"""(key of the job, flag, what was given, the value that it stands for); None where not given."""
+
+
+def scene_flags(
     *,
-    grid: str | None = None,
-    density_scale: float | None = None,
-    color: str | None = None,
-    color_grid: str | None = None,
-    eye: str | None = None,
-    target: str | None = None,
-    up: str | None = None,
-    fov: float | None = None,
-    ortho: float | None = None,
-    image_size: str | None = None,
-    interpolation: str | None = None,
-) -> Any:
-    """The job of a volume, a job file or a picture of volcli's, with options on top.
+    grid: str | None,
+    density_scale: float | None,
+    color: str | None,
+    color_grid: str | None,
+    eye: str | None,
+    target: str | None,
+    up: str | None,
+    fov: float | None,
+    ortho: float | None,
+    image_size: str | None,
+    interpolation: str | None,
+) -> list[Flag]:
+    """The options of this module as settings of the job.
 
     Raises
     ------
     UsageError
-        In one line, for the first thing that is wrong.
+        Two exclude each other, or one is not what it takes.
     """
     if color is not None and color_grid is not None:
         raise UsageError("--color and --color-grid exclude each other; give one")
     if fov is not None and ortho is not None:
         raise UsageError("--fov and --ortho exclude each other; give one")
     lens = "perspective" if fov is not None else "orthographic" if ortho is not None else None
-    given: list[tuple[str, str, Any, Any]] = [
+    return [
         ("density.grid", "--grid", grid, grid),
         ("density.scale", "--density-scale", density_scale, density_scale),
         ("color.constant", "--color", color, numbers("--color", color)),
@@ -82,16 +87,40 @@ def job_of(
         ("camera.resolution", "--size", image_size, size(image_size)),
         ("density.interpolation", "--interpolation", interpolation, interpolation),
     ]
-    flags = [(key, value) for key, _, _, value in given if value is not None]
-    spelled = {key: f"{flag} {text}" for key, flag, text, _ in given if text is not None}
+
+
+def values_of(flags: Sequence[Flag]) -> list[tuple[str, Any]]:
+    """(key, value) of the options that were given."""
+    return [(key, value) for key, _, _, value in flags if value is not None]
+
+
+def spellings_of(flags: Sequence[Flag]) -> dict[str, str]:
+    """How the user wrote the options that were given, by key: ``--step 0``."""
+    return {key: f"{flag} {_typed(text)}" for key, flag, text, _ in flags if text is not None}
+
+
+def _typed(value: Any) -> str:
+    """A value about as it was typed: 0 rather than 0.0."""
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def job_of(source: Path, flags: Sequence[Flag], settings: Sequence[str]) -> Job:
+    """The job of a volume, a job file or a picture of volcli's, with options on top.
+
+    Raises
+    ------
+    UsageError
+        In one line, for the first thing that is wrong.
+    """
     from volcli.config import load_job, make_job, parse_setting
 
+    spelled = spellings_of(flags)
     if source.suffix.lower() not in PICTURES:
-        return load_job(source, flags=flags, settings=settings or [], spelled=spelled)
+        return load_job(source, flags=values_of(flags), settings=settings, spelled=spelled)
     from volcli.opacity.maps import job_of_picture
 
-    extra = [parse_setting(text) for text in settings or []]
-    spelled |= {key: f"--set {text}" for (key, _), text in zip(extra, settings or [], strict=True)}
+    extra = [parse_setting(text) for text in settings]
+    spelled |= {key: f"--set {text}" for (key, _), text in zip(extra, settings, strict=True)}
     tables = job_of_picture(source)
     tables.pop("output", None)
-    return make_job(tables, [*flags, *extra], source=str(source), spelled=spelled)
+    return make_job(tables, [*values_of(flags), *extra], source=str(source), spelled=spelled)
