@@ -5,10 +5,12 @@ Images have a writer of their own, which reads back what it wrote (`volcli.image
 
 from __future__ import annotations
 
+import io
 import os
 import secrets
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from volcli.errors import OutputError
 
@@ -40,3 +42,27 @@ def write_file(path: Path, content: bytes, *, overwrite: bool = True) -> None:
     finally:
         with suppress(OSError):
             temporary.unlink()
+
+
+FIGURES = (".png", ".svg", ".pdf")
+"""The extensions of figures."""
+
+_UNDATED: dict[str, dict[str, None]] = {
+    ".png": {"Software": None},
+    ".svg": {"Date": None},
+    ".pdf": {"CreationDate": None},
+}
+
+
+def write_figure(path: Path, figure: Any, *, overwrite: bool = True) -> None:
+    """Write a figure of matplotlib's in the format of the path's extension, without a date.
+
+    Raises
+    ------
+    OutputError
+        As `write_file`.
+    """
+    buffer = io.BytesIO()
+    kind = path.suffix.lower()
+    figure.savefig(buffer, format=kind.lstrip("."), metadata=_UNDATED[kind])
+    write_file(path, buffer.getvalue(), overwrite=overwrite)

@@ -53,12 +53,13 @@ def compare(
     in one image alone exceeds any limit.
     """
     behind = background_of(background)
+    from volcli.files import FIGURES
     from volcli.images import check_output
     from volcli.opacity.difference import Pair, read_pair, write_difference
     from volcli.opacity.difference import compare as compare_pair
 
     if difference is not None:
-        check_output(difference, overwrite=overwrite, kinds=(".exr", ".png", ".svg", ".pdf"))
+        check_output(difference, overwrite=overwrite, kinds=(".exr", *FIGURES))
     pair = read_pair(a, b, background=behind)
     wanted = names(channels)
     if wanted is not None:

@@ -17,7 +17,6 @@ from volcli.schema import MAPS
 if TYPE_CHECKING:
     from volcli.opacity.maps import Maps
 
-_FIGURES = (".png", ".svg", ".pdf")
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
@@ -84,6 +83,7 @@ def inspect(
         raise UsageError(f"--map {name}: must be one of {', '.join(MAPS)}")
     if heatmap is not None and len(images) > 1:
         raise UsageError("--heatmap draws one image; give one, or --html for several")
+    from volcli.files import FIGURES
     from volcli.images import check_output
     from volcli.opacity.colormap import shades
     from volcli.opacity.findings import findings
@@ -91,7 +91,7 @@ def inspect(
     from volcli.opacity.statistics import statistics
 
     if heatmap is not None:
-        check_output(heatmap, overwrite=overwrite, kinds=_FIGURES)
+        check_output(heatmap, overwrite=overwrite, kinds=FIGURES)
     if html is not None:
         check_output(html, overwrite=overwrite, kinds=(".html", ".htm"))
     if heatmap is not None or html is not None or colormap != "viridis":

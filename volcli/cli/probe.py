@@ -94,6 +94,7 @@ def probe(
         interpolation=interpolation,
     )
     job = options.job_of(source, flags, settings or [])
+    from volcli.files import FIGURES, write_file
     from volcli.images import check_output
     from volcli.probe.rays import probe_job
     from volcli.probe.report import as_csv
@@ -101,12 +102,10 @@ def probe(
     if csv is not None:
         check_output(csv, overwrite=overwrite, kinds=(".csv",))
     if plot is not None:
-        check_output(plot, overwrite=overwrite, kinds=(".png", ".svg", ".pdf"))
+        check_output(plot, overwrite=overwrite, kinds=FIGURES)
     found, walks, warnings = probe_job(job, pixels, lines, step)
     _warn(warnings)
     if csv is not None:
-        from volcli.files import write_file
-
         write_file(csv, as_csv(found), overwrite=overwrite)
     if plot is not None:
         from volcli.probe.plot import write_plot

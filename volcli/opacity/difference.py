@@ -6,7 +6,6 @@ and premultiplied first. Before a background, both are put behind it (`backgroun
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from volcli.errors import UsageError
-from volcli.files import write_file
+from volcli.files import write_figure
 from volcli.images import (
     Channels,
     flip,
@@ -25,8 +24,7 @@ from volcli.images import (
     write_exr,
 )
 from volcli.opacity.background import Background, behind_of, recomposite
-from volcli.opacity.colormap import shades
-from volcli.opacity.heatmap import reduced
+from volcli.opacity.heatmap import drawn, reduced
 from volcli.opacity.maps import Floats, read_maps, values_of_map
 
 
@@ -175,41 +173,24 @@ def write_difference(
     if path.suffix.lower() == ".exr":
         write_exr(path, differences, {"volcli:difference": title}, overwrite=overwrite)
         return
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.colors import ListedColormap, LogNorm
-    from matplotlib.figure import Figure
+    from matplotlib.colors import LogNorm
 
     names = [c for c in "RGBA" if c in differences] if pair.has_colour else list(differences)
     largest = np.max([np.abs(differences[name]) for name in names], axis=0)
     shown = reduced(largest)
-    finite = shown[np.isfinite(shown)]
-    high = float(finite.max(initial=0)) or 1.0
+    high = float(shown.max(where=np.isfinite(shown), initial=0)) or 1.0
     height, width = largest.shape
-    figure = Figure(
-        figsize=(9.5, min(max(8 * height / width, 2.5), 14) + 0.9), dpi=120, layout="constrained"
-    )
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    same = ~np.isfinite(shown) | (shown <= 0)
-    drawn = axes.imshow(
-        np.ma.masked_array(shown, same),
-        cmap=ListedColormap(shades(colormap) / 255.0).with_extremes(bad="0.8"),
+    figure, _ = drawn(
+        np.ma.masked_array(shown, ~np.isfinite(shown) | (shown <= 0)),
+        (width, height),
+        colormap=colormap,
         norm=LogNorm(high * 1e-4, high),
-        extent=(0, width, height, 0),
-        interpolation="nearest",
+        label=f"largest |B - A| of {', '.join(names)}",
+        title=title,
+        missing="the same",
+        extend="min",
     )
-    figure.colorbar(drawn, ax=axes, shrink=0.9, pad=0.02, extend="min").set_label(
-        f"largest |B - A| of {', '.join(names)}"
-    )
-    axes.set_title(title, loc="left", fontsize=10)
-    axes.annotate(
-        "grey: the same", (1, 1.01), xycoords="axes fraction", ha="right", fontsize=8, color="0.35"
-    )
-    axes.set_xlabel("x, pixels")
-    axes.set_ylabel("y, pixels")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=path.suffix.lower().lstrip("."))
-    write_file(path, buffer.getvalue(), overwrite=overwrite)
+    write_figure(path, figure, overwrite=overwrite)
 
 
 def _is_encoded(image: Channels) -> bool:

@@ -102,11 +102,16 @@ def _visibility(numbers: dict[str, Any]) -> list[tuple[str, str]]:
         found.append(
             (
                 "black",
-                f"colour is at most {colour['max']:.3g} where there is opacity: the volume hides "
-                f"what is behind it and emits nothing; see --color, --color-grid",
+                f"colour is {_at_most(colour['max'])} where "
+                f"there is opacity: the volume hides what is behind it and emits nothing; see "
+                f"--color, --color-grid",
             )
         )
     return found
+
+
+def _at_most(value: float) -> str:
+    return f"at most {value:.3g}" if value else "0"
 
 
 def _framing(numbers: dict[str, Any]) -> list[tuple[str, str]]:

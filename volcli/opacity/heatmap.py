@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from volcli.files import write_file
+from volcli.files import write_figure
 from volcli.opacity.colormap import limits, shades
 from volcli.opacity.maps import Maps
 
@@ -63,50 +63,86 @@ def write_heatmap(
     OutputError
         The file cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.colors import ListedColormap, LogNorm, Normalize
-    from matplotlib.figure import Figure
+    from matplotlib.colors import LogNorm, Normalize
 
-    colours = ListedColormap(shades(colormap) / 255.0, name=colormap).with_extremes(bad=_NOTHING)
     values = maps.layers[name]
     low, high = limits(name, values, logarithmic)
-    norm = LogNorm(low, high) if logarithmic else Normalize(low, high)
-    height, width = values.shape
     shown = reduced(values)
     missing = ~np.isfinite(shown) | ((shown <= 0) if logarithmic else False)
+    figure, axes = drawn(
+        np.ma.masked_array(shown, missing),
+        maps.stored.size,
+        colormap=colormap,
+        norm=LogNorm(low, high) if logarithmic else Normalize(low, high),
+        label=LABELS[name],
+        title=maps.stored.path.name,
+        missing="0" if logarithmic else "nothing",
+    )
+    if contours:
+        _draw_contours(axes, maps.opacity, contours)
+    write_figure(path, figure, overwrite=overwrite)
 
+
+def drawn(
+    values: Any,
+    size: tuple[int, int],
+    *,
+    colormap: str,
+    norm: Any,
+    label: str,
+    title: str,
+    missing: str,
+    extend: str = "neither",
+) -> tuple[Any, Any]:
+    """A figure of values in colours with a colour bar, and its axes, in pixels of the image.
+
+    Parameters
+    ----------
+    values
+        A masked array, of the image's shape or `reduced`; grey where it is masked.
+    size
+        (width, height) of the image.
+    missing
+        What grey stands for.
+
+    Raises
+    ------
+    UsageError
+        matplotlib has no such colour map.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+
+    width, height = size
     tall = min(max(8 * height / width, 2.5), 14)
     figure = Figure(figsize=(9.5, tall + 0.9), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    drawn = axes.imshow(
-        np.ma.masked_array(shown, missing),
-        cmap=colours,
+    image = axes.imshow(
+        values,
+        cmap=ListedColormap(shades(colormap) / 255.0).with_extremes(bad=_NOTHING),
         norm=norm,
         extent=(0, width, height, 0),
         interpolation="nearest",
-        aspect="equal",
     )
-    bar = figure.colorbar(drawn, ax=axes, shrink=0.9, pad=0.02)
-    bar.set_label(LABELS[name])
-    if contours:
-        _draw_contours(axes, maps.opacity, contours)
-    axes.set_title(maps.stored.path.name, loc="left", fontsize=10)
+    figure.colorbar(image, ax=axes, shrink=0.9, pad=0.02, extend=extend).set_label(label)
+    axes.set_title(title, loc="left", fontsize=10)
     axes.set_xlabel("x, pixels")
     axes.set_ylabel("y, pixels")
-    if missing.any():
-        what = "grey: 0" if logarithmic else "grey: nothing"
+    if np.ma.getmaskarray(values).any():
         axes.annotate(
-            what, (1, 1.01), xycoords="axes fraction", ha="right", fontsize=8, color="0.35"
+            f"grey: {missing}",
+            (1, 1.01),
+            xycoords="axes fraction",
+            ha="right",
+            fontsize=8,
+            color="0.35",
         )
-    buffer = io.BytesIO()
-    kind = path.suffix.lower().lstrip(".")
-    plain = {"Software": None} if kind == "png" else {"Date": None} if kind == "svg" else {}
-    figure.savefig(buffer, format=kind, metadata=plain)
-    write_file(path, buffer.getvalue(), overwrite=overwrite)
+    return figure, axes
 
 
-def _draw_contours(axes: object, opacity: NDArray[np.float32], levels: tuple[float, ...]) -> None:
+def _draw_contours(axes: Any, opacity: NDArray[np.float32], levels: tuple[float, ...]) -> None:
     """Lines of equal opacity, white with a dark rim, so that they show on any colour."""
     from matplotlib.patheffects import withStroke
 
@@ -115,12 +151,10 @@ def _draw_contours(axes: object, opacity: NDArray[np.float32], levels: tuple[flo
     rows, columns = values.shape
     x = (np.arange(columns) + 0.5) * (width / columns)
     y = (np.arange(rows) + 0.5) * (height / rows)
-    lines = axes.contour(  # type: ignore[attr-defined]
-        x, y, values, levels=sorted(set(levels)), colors="white", linewidths=1.0
-    )
+    lines = axes.contour(x, y, values, levels=sorted(set(levels)), colors="white", linewidths=1.0)
     rim = [withStroke(linewidth=2.2, foreground="black")]
     lines.set_path_effects(rim)
-    for label in axes.clabel(lines, fmt="%g", fontsize=8):  # type: ignore[attr-defined]
+    for label in axes.clabel(lines, fmt="%g", fontsize=8):
         label.set_path_effects(rim)
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from volcli.files import write_file
+from volcli.files import write_figure
 from volcli.probe.walk import FALLS, Walk
 
 MOST_RAYS = 6
@@ -53,9 +52,7 @@ def write_plot(
         axes[0].set_xlim(t[0], t[-1])
     for row, label in enumerate(("extinction sigma", "transmittance T", "T sigma, and radiance")):
         grid[row, 0].set_ylabel(label)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=path.suffix.lower().lstrip("."))
-    write_file(path, buffer.getvalue(), overwrite=overwrite)
+    write_figure(path, figure, overwrite=overwrite)
 
 
 def title_of(ray: dict[str, Any]) -> str:
