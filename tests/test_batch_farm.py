@@ -52,7 +52,7 @@ class Cluster:
         while not where.exists() or not where.read_text().strip():
             assert time.monotonic() < end and self.scheduler.poll() is None
             time.sleep(0.05)
-        self.address = json.loads(where.read_text())["address"]
+        self.file, self.address = where, json.loads(where.read_text())["address"]
 
     def close(self):
         for process in (*self.workers, self.scheduler):
@@ -108,7 +108,7 @@ def test_one_of_two_workers_is_killed_half_way_and_all_is_done_to_the_bit(tmp_pa
 def test_pictures_are_sent_back_and_tiles_put_together_to_the_bit(tmp_path, cluster, local):
     batch, out = write_batch(tmp_path, TURNTABLE), tmp_path / "out"
     for option in (["--collect"], ["--tile", "64"], ["--collect", "--tile", "50"]):
-        ran = volcli("batch", batch, "--scheduler", cluster.address, "--force", *option)
+        ran = volcli("batch", batch, "--scheduler", cluster.file, "--force", *option)
         assert ran.code == 0, ran.err
         same_pictures(out, local)
         for path in out.glob("*.exr"):
@@ -181,6 +181,10 @@ def test_where_no_scheduler_answers_is_told_in_a_line(tmp_path, monkeypatch):
     assert "--scheduler tcp://127.0.0.1:9: no scheduler answers there" in ran.err
     ran = volcli("batch", batch, "--scheduler", "nonsense://x", "--resume")
     assert ran.code == 2
+    monkeypatch.setattr("volcli.batch.farm._FILE_SECONDS", 0.2)
+    ran = volcli("batch", batch, "--scheduler", tmp_path / "none.json", "--resume")
+    assert ran.code == 2
+    assert "no scheduler has written its address there" in ran.err
     monkeypatch.setattr("volcli.batch.farm.is_installed", lambda: False)
     ran = volcli("batch", batch, "--scheduler", "tcp://127.0.0.1:9", "--resume")
     assert ran.code == 2

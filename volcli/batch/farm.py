@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
+import json
 import logging
 import os
 import queue
@@ -18,12 +19,13 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from volcli.batch.work import AT_ONCE, Limits, Outcome, Task, Worker
 from volcli.errors import UsageError, VolcliError
 
-_ANSWER_SECONDS = 10
+_ANSWER_SECONDS, _FILE_SECONDS = 10, 60
 _LOOK_SECONDS = 1.0
 """How often it is asked which workers there are."""
 
@@ -42,7 +44,8 @@ class Farm:
     Parameters
     ----------
     address
-        Of a scheduler; None: a cluster of ``count`` workers on this machine.
+        Of a scheduler, or the file that it was told to write it to (``*.json``), which is waited
+        for; None: a cluster of ``count`` workers on this machine.
     on_start
         Called with the process id of each worker that is on this machine.
     note
@@ -70,6 +73,8 @@ class Farm:
         self._limits, self._on_start, self._note = limits, on_start, note
         self._cluster = _cluster(count, limits) if address is None else None
         self._name = address or "the local cluster"
+        if address is not None and address.endswith(".json"):
+            address = _read_address(Path(address))
         try:
             self._client = Client(
                 address or self._cluster, timeout=_ANSWER_SECONDS, set_as_default=False
@@ -197,6 +202,21 @@ def _cluster(count: int, limits: Limits) -> Any:
             security=Security.temporary(),
             silence_logs=logging.CRITICAL,
         )
+
+
+def _read_address(file: Path) -> str:
+    """The address that a scheduler writes to its ``--scheduler-file`` once it is there."""
+    end = time.monotonic() + _FILE_SECONDS
+    while True:
+        try:
+            return str(json.loads(file.read_text())["address"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            if time.monotonic() > end:
+                raise UsageError(
+                    f"--scheduler {file}: no scheduler has written its address there in "
+                    f"{_FILE_SECONDS} s ({_line(error)})"
+                ) from error
+        time.sleep(0.1)
 
 
 def _silence() -> None:

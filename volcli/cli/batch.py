@@ -35,7 +35,8 @@ def batch(
         str | None,
         typer.Option(
             metavar="ADDRESS",
-            help="A dask scheduler, tcp://HOST:PORT, whose workers do the jobs instead.",
+            help="A dask scheduler whose workers do the jobs instead: tcp://HOST:PORT, or the file "
+            "that it was given as --scheduler-file.",
         ),
     ] = None,
     threads: Annotated[
