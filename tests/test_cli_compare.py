@@ -8,7 +8,7 @@ from commandline import ROOT, volcli, write_ball
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from test_opacity import RAMP, write_volcli_exr
+from pictures import RAMP, write_volcli_exr
 
 from volcli import images
 from volcli.srgb import srgb_from_linear

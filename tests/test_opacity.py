@@ -10,6 +10,7 @@ from commandline import SAMPLES, volcli, write_ball
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from pictures import RAMP, write_volcli_exr
 
 from volcli import images
 from volcli.errors import UsageError
@@ -20,21 +21,6 @@ from volcli.opacity.statistics import PERCENTILES, statistics
 pytestmark = pytest.mark.filterwarnings("error")
 
 
-def write_volcli_exr(path, tau, colour=(0.5, 0.25, 1.0), behind=None, header=None):
-    """An EXR as volcli writes it, of an optical depth (h, w)."""
-    tau = np.asarray(tau, np.float64)
-    opacity, through = -np.expm1(-tau), np.exp(-tau)
-    rgba = np.dstack([*(opacity * c for c in colour), opacity])
-    if behind is not None:
-        rgba = rgba + through[..., None] * np.array([*behind, 1.0])
-    channels = {c: rgba[..., i] for i, c in enumerate("RGBA")}
-    channels["Z"] = np.where(opacity > 0, 5.0, np.inf)
-    channels |= {"transmittance.Y": through, "optical_depth.Y": tau}
-    job = "" if behind is None else f"[background]\ncolor = {list(behind)}\n"
-    images.write_exr(path, channels, {"volcli:job": job, **(header or {})})
-    return path
-
-
 def numbers_of(path):
     found = statistics(read_maps(path))
     found["findings"] = findings(found)
@@ -43,9 +29,6 @@ def numbers_of(path):
 
 def kinds(path):
     return [found["kind"] for found in numbers_of(path)["findings"]]
-
-
-RAMP = np.linspace(0, 3, 48 * 32).reshape(32, 48)
 
 
 # -- maps -----------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from commandline import volcli
-from test_opacity import RAMP, write_volcli_exr
+from pictures import RAMP, write_volcli_exr
 
 from volcli import images
 from volcli.srgb import srgb_from_linear

@@ -9,7 +9,7 @@ import sys
 
 import numpy as np
 import pytest
-from test_opacity import RAMP, write_volcli_exr
+from pictures import RAMP, write_volcli_exr
 
 from volcli.opacity.blocks import averaged, half_blocks, picture_and_map
 from volcli.opacity.colormap import shades

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from volcli.cli import scene as options
+from volcli.cli.progress import Bars
 from volcli.cli.table import say, table, terminal_width
 from volcli.errors import UsageError
 
@@ -103,7 +105,8 @@ def probe(
         check_output(csv, overwrite=overwrite, kinds=(".csv",))
     if plot is not None:
         check_output(plot, overwrite=overwrite, kinds=FIGURES)
-    found, walks, warnings = probe_job(job, pixels, lines, step)
+    with Bars(quiet=False) as bars:
+        found, walks, warnings = probe_job(job, pixels, lines, step, bars)
     _warn(warnings)
     if csv is not None:
         write_file(csv, as_csv(found), overwrite=overwrite)
@@ -121,8 +124,6 @@ def probe(
 
 
 def _warn(warnings: list[str]) -> None:
-    import sys
-
     for warning in warnings:
         print(f"volcli: {warning}", file=sys.stderr)
 

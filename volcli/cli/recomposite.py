@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -30,8 +31,6 @@ def recomposite(
 
     The background that it was rendered over is taken away first. An EXR keeps the layers.
     """
-    import sys
-
     from volcli.images import check_output
     from volcli.opacity.background import write_recomposite
 

@@ -14,7 +14,7 @@ from volcli.plan import Plan
 from volcli.probe.report import report
 from volcli.probe.rules import seen_by, with_step
 from volcli.probe.walk import Walk, walk
-from volcli.run import UNKNOWN_BOX, load, prepare
+from volcli.run import UNKNOWN_BOX, OnStage, load, prepare
 from volcli.scene import scene_box
 from volcli.schema import Job
 
@@ -30,6 +30,7 @@ def probe_job(
     pixels: Sequence[tuple[float, ...]],
     lines: Sequence[tuple[float, ...]],
     steps: Sequence[float] | None = None,
+    on_stage: OnStage = lambda stage, done, total: None,
 ) -> tuple[list[dict[str, Any]], list[Walk | None], list[str]]:
     """Follow rays through the scene of a job.
 
@@ -42,6 +43,8 @@ def probe_job(
     steps
         Steps of the midpoint rule, in voxels, that are shown beside the exact rule; None: the job's
         step, else `DEFAULT_STEP`.
+    on_stage
+        Told of the reading, as `run.load` tells.
 
     Returns
     -------
@@ -54,7 +57,7 @@ def probe_job(
         a direction.
     """
     prepared = prepare(job.model_copy(update={"output": type(job.output)()}), writes=False)
-    loaded = load(prepared)
+    loaded = load(prepared, on_stage)
     plan, scene = prepared.plan, loaded.scene
     box = scene_box(scene)
     camera = make_camera(prepared.job.camera, UNKNOWN_BOX if box is None else box)
