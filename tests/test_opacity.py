@@ -312,6 +312,19 @@ def test_a_heat_map_shows_each_value_in_its_colour_and_only_a_thin_medium_on_log
     np.testing.assert_array_equal(shades("gray")[[0, -1]], [[0] * 3, [255] * 3])
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (1, 50), (50, 1), (3, 4000)])
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0, np.nan, np.inf])
+def test_a_picture_of_any_shape_and_value_can_be_looked_at(tmp_path, shape, value):
+    values = np.full(shape, value)
+    values[0, 0] = 0.25
+    images.write_exr(tmp_path / "a.exr", dict.fromkeys("RGBA", values), {})
+    for options in (["--contours", "0.3"], ["--log"]):
+        ran = volcli("inspect", tmp_path / "a.exr", "--heatmap", tmp_path / "h.png", *options)
+        assert ran.code == 0, ran.err
+    assert volcli("inspect", tmp_path / "a.exr", "--html", tmp_path / "p.html").code == 0
+    json.loads(volcli("inspect", tmp_path / "a.exr", "--json").out)
+
+
 @pytest.mark.parametrize("size", [(9, 7), (4000, 30), (33, 3201)])
 def test_a_large_map_is_shown_by_means_of_squares(size):
     from volcli.opacity.heatmap import LARGEST, reduced

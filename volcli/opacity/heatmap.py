@@ -78,7 +78,7 @@ def write_heatmap(
         title=maps.stored.path.name,
         missing="0" if logarithmic else "nothing",
     )
-    if contours:
+    if contours and min(shown.shape) > 1:  # of one row or column there are no lines
         _draw_contours(axes, maps.opacity, contours)
     write_figure(path, figure, overwrite=overwrite)
 
