@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 import reference
-from commandline import SAMPLES, volcli, write_ball
+from commandline import SAMPLES, volcli, write_ball, write_grid
 from hypothesis import given
 from hypothesis import strategies as st
 from scenes import (
@@ -272,6 +272,19 @@ def test_without_a_step_there_are_no_samples_and_a_step_is_a_plan_of_its_own():
     scene = Scene(SLAB.grid, 1.0, WHITE)
     np.testing.assert_allclose(sample_distances(scene, plan, *ALONG), [6, 8, 10, 12, 14])
     assert len(seen_by(scene, with_step(plan, None), *ALONG).samples) == 0
+
+
+def test_a_ray_too_long_for_the_default_step_is_shown_without_and_a_step_that_is_asked_for_refused(
+    tmp_path,
+):
+    far = ((0, 0, 0), (0, 0, 400_000_000))
+    leaves = {o: (np.ones((8, 8, 8)), np.ones((8, 8, 8), bool)) for o in far}
+    path = write_grid(tmp_path / "far.vdb", leaves=leaves)
+    (ray,) = probed(path, "--ray", "2,2,-5,0,0,1")
+    assert [rule["rule"] for rule in ray["rules"]] == ["exact", "exact, nearest"]
+    ran = volcli("probe", path, "--ray", "2,2,-5,0,0,1", "--step", "1")
+    assert ran.code == 2
+    assert "samples of one ray" in ran.err
 
 
 # -- the report and the command -------------------------------------------------------------------

@@ -12,8 +12,9 @@ from volcli.camera import Camera, make_camera
 from volcli.errors import UsageError
 from volcli.plan import Plan
 from volcli.probe.report import report
-from volcli.probe.rules import seen_by, with_step
+from volcli.probe.rules import sample_count, seen_by, with_step
 from volcli.probe.walk import Walk, walk
+from volcli.render import MAX_STEPS, Scene
 from volcli.run import UNKNOWN_BOX, OnStage, load, prepare
 from volcli.scene import scene_box
 from volcli.schema import Job
@@ -65,7 +66,12 @@ def probe_job(
     found, walks = [], []
     for pixel, origin, direction, depth in rays:
         walked = walk(scene, plan.nearest, origin, direction)
-        seen = [seen_by(scene, one, origin, direction) for one in _rules(plan, steps)]
+        rules = [
+            rule
+            for rule in _rules(plan, steps)
+            if steps or rule.step_voxels is None or _short(scene, rule, origin, direction)
+        ]
+        seen = [seen_by(scene, rule, origin, direction) for rule in rules]
         walks.append(walked)
         found.append(report(walked, seen, origin, direction, pixel=pixel, depth_per_distance=depth))
     warnings = [*plan.warnings, *loaded.warnings]
@@ -84,6 +90,11 @@ def _rules(plan: Plan, steps: Sequence[float] | None) -> list[Plan]:
     exact = with_step(plan, None)
     other = replace(exact, nearest=not plan.nearest)
     return [exact, *(with_step(plan, step) for step in steps), other]
+
+
+def _short(scene: Scene, rule: Plan, origin: Any, direction: Any) -> bool:
+    """Whether midpoint, for which nobody asked, can be shown on this ray at all."""
+    return sample_count(scene, rule, origin, direction) <= MAX_STEPS
 
 
 def _through(camera: Camera, pixels: Sequence[tuple[float, ...]]) -> Rays:

@@ -62,6 +62,16 @@ def with_step(plan: Plan, step_voxels: float | None) -> Plan:
     return replace(plan, step_voxels=step_voxels)
 
 
+def sample_count(scene: Scene, plan: Plan, origin: Floats, direction: Floats) -> float:
+    """Steps of the midpoint rule along a ray; the last may be a part of one."""
+    line = make_line(scene.density, plan.nearest, origin, direction)
+    near, far = line.span
+    if scene.density.is_empty or not near < far:
+        return 0.0
+    assert plan.step_voxels is not None, "asked for by the caller"
+    return (far - near) * float(np.linalg.norm(line.d)) / plan.step_voxels
+
+
 def sample_distances(scene: Scene, plan: Plan, origin: Floats, direction: Floats) -> Floats:
     """(m,): where the midpoint rule samples: in the middle of each step, the last one cut.
 
@@ -70,14 +80,13 @@ def sample_distances(scene: Scene, plan: Plan, origin: Floats, direction: Floats
     UsageError
         There would be more than `render.MAX_STEPS`.
     """
-    line = make_line(scene.density, plan.nearest, origin, direction)
-    near, far = line.span
-    if scene.density.is_empty or not near < far:
+    count = sample_count(scene, plan, origin, direction)
+    if count == 0:
         return np.empty(0)
-    assert plan.step_voxels is not None, "asked for by the caller"
-    step = plan.step_voxels / float(np.linalg.norm(line.d))
-    count = (far - near) / step
     if count > MAX_STEPS:
         raise UsageError(f"--step {plan.step_voxels:g}: {count:.0e} samples of one ray; give more")
+    line = make_line(scene.density, plan.nearest, origin, direction)
+    near, far = line.span
+    step = (far - near) / count
     begin = np.arange(np.ceil(count)) * step
     return near + (begin + np.minimum(begin + step, far - near)) / 2
