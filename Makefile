@@ -34,6 +34,7 @@ bench: $(SETUP)
 	$(BIN)/python -m benchmarks.render
 	$(BIN)/python -m benchmarks.peers
 	$(BIN)/python -m benchmarks.scaling
+	$(BIN)/python -m benchmarks.batch
 	$(BIN)/python -m benchmarks.report
 
 # The README's pictures.
@@ -44,6 +45,7 @@ gallery: $(SETUP)
 	$(BIN)/volcli render configs/colored_smoke.toml -o docs/gallery/colored_smoke.png --size 336x480 --set output.maps=[]
 	$(BIN)/volcli render configs/rotated.toml -o docs/gallery/rotated.png --size 480x480 --set output.maps=[]
 	$(BIN)/volcli render configs/panorama.toml -o docs/gallery/panorama.png --size 800x400 --set camera.samples=9
+	$(BIN)/volcli batch configs/batch/turntable.toml --force --contact-sheet docs/gallery/turntable.png
 	$(BIN)/python docs/strip_headers.py docs/gallery/*.png
 
 # Pictures of volumes that are not ours, from a folder that has them: make gallery-elsewhere VOLUMES=...

@@ -172,6 +172,30 @@ def scaling(results: dict[str, Any]) -> str:
     )
 
 
+def batch(results: dict[str, Any]) -> str:
+    """A batch beside a shell loop, and after it was killed."""
+    mixed, killed = results["mixed"], results["killed"]
+    rows = [["", "seconds", "of the loop's (least to most)"]]
+    names = {"loop": "a shell loop over `volcli render`", "processes": "plain processes"}
+    names["cluster"] = "a dask cluster of this machine"
+    for key, name in names.items():
+        if key not in mixed:
+            continue
+        told = mixed[key]
+        seconds, share = told.get("seconds", told), told.get("of_the_loop")
+        text = f"{share['median']:.2f} ({share['min']:.2f} to {share['max']:.2f})" if share else ""
+        rows.append([name, f"{seconds['median']:.1f} s", text])
+    agree = "agree" if killed["manifest_and_folder_agree"] else "do not agree"
+    return (
+        f"{_markdown(rows)}\n\n{mixed['jobs']} mixed jobs, {mixed['workers']} workers, "
+        f"{results['machine']['threads']} processors, {mixed['loop']['rounds']} rounds. And "
+        f"{killed['jobs']} small jobs, killed {killed['kills']} times and resumed:\n"
+        f"{killed['pictures']} pictures, {killed['rendered_again_though_recorded']} rendered again "
+        f"though recorded as done, {killed['temporary_files_left']} temporary files left; manifest "
+        f"and folder {agree}."
+    )
+
+
 def _error(value: float | None) -> str:
     return "-" if value is None else f"{value:.0e}".replace("e-0", "e-")
 
@@ -181,7 +205,7 @@ def _markdown(rows: list[list[str]]) -> str:
     return "\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]])
 
 
-BLOCKS = (accuracy, peers, render, load, load_large, startup, scaling)
+BLOCKS = (accuracy, peers, render, load, load_large, startup, scaling, batch)
 """What the README has a place for; each is made of the results of its name."""
 
 

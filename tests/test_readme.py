@@ -5,10 +5,11 @@ import io
 import json
 import re
 import shlex
+import shutil
 import tomllib
 
 import pytest
-from commandline import ROOT, volcli
+from commandline import ROOT, volcli, write_ball
 
 from volcli.config import make_job
 from volcli.schema import Job
@@ -43,6 +44,13 @@ def test_the_readme_has_examples():
 @pytest.mark.parametrize("command", commands())
 def test_each_command_of_the_readme_does_what_the_text_beside_it_says(command, checkout):
     words = shlex.split(command)[1:]
+    if words[0] == "batch":
+        _run_in_small(words, checkout)
+        return
+    if "--frames" in words:
+        (checkout / "sim").mkdir()
+        for frame in (1, 2, 3):
+            write_ball(checkout / words[1].replace("####", f"{frame:04d}"))
     if words[0] == "render":  # small: what is tested is that it runs, not the picture
         words += ["--size", "64x48"]
     else:  # pictures that an earlier example made
@@ -52,6 +60,8 @@ def test_each_command_of_the_readme_does_what_the_text_beside_it_says(command, c
     assert ran.code == 0, ran.err
     if "-o" in words:
         written = checkout / words[words.index("-o") + 1]
+        if "--frames" in words:
+            written = checkout / words[words.index("-o") + 1].replace("####", "0003")
         if "camera.frame=all" in words:
             written = written.with_name(f"{written.stem}.0002{written.suffix}")
         assert written.stat().st_size > 0
@@ -69,6 +79,20 @@ def test_each_command_of_the_readme_does_what_the_text_beside_it_says(command, c
         assert ran.out
     if "--eye" not in words and words[1].endswith(".vdb") and words[0] == "render":
         assert "camera chosen: --eye" in ran.err
+
+
+def _run_in_small(words, checkout):
+    """A batch of the README, in a folder where none was before, or one was interrupted."""
+    (checkout / "configs").unlink()
+    shutil.copytree(ROOT / "configs", checkout / "configs")  # outputs lie beside it
+    small = ("--set", "camera.resolution=[24,18]")
+    ran = volcli(*words, *small)
+    assert ran.code == 0, ran.err
+    assert ran.out
+    if "--contact-sheet" in words:
+        assert (checkout / words[words.index("--contact-sheet") + 1]).stat().st_size > 0
+    pictures = list((checkout / "out").rglob("*.exr"))
+    assert bool(pictures) == ("--dry-run" not in words)
 
 
 def test_the_job_file_of_the_readme_is_a_job_that_names_every_part():

@@ -198,7 +198,7 @@ def _cluster(count: int, limits: Limits) -> Any:
             threads_per_worker=AT_ONCE,
             processes=True,
             memory_limit=limits.memory or 0,
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",  # None would have it listen to all the world
             security=Security.temporary(),
             silence_logs=logging.CRITICAL,
         )
