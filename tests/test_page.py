@@ -207,6 +207,14 @@ def test_the_line_of_equal_opacity_lies_where_opacity_is_that(opened, tmp_path):
     assert np.any(np.abs(column - crossing) < 0.2), (column, crossing)
 
 
+def test_the_line_reaches_as_far_as_the_opacity_of_a_thin_medium(opened, tmp_path):
+    write_volcli_exr(tmp_path / "a.exr", RAMP * 1e-3)
+    page = settled(opened("a.exr", at="#layer=opacity&line=1"))
+    most = -np.expm1(-RAMP.max() * 1e-3)
+    assert float(page.locator("#iso").get_attribute("max")) == pytest.approx(most, rel=1e-6)
+    assert float(page.locator("#iso-value").inner_text()) == pytest.approx(most / 2, rel=0.01)
+
+
 def test_two_images_are_wiped_between(opened, tmp_path):
     write_volcli_exr(tmp_path / "a.exr", np.full((HEIGHT, WIDTH), 0.5))
     write_volcli_exr(tmp_path / "b.exr", np.full((HEIGHT, WIDTH), 2.5))

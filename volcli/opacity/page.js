@@ -310,7 +310,8 @@ function drawHistogram() {
   }
   $("least").textContent = show(valueAt(0, name));
   $("most").textContent = show(valueAt(1, name));
-  $("histogram-title").textContent = `Histogram of ${titleOf(name).toLowerCase()}`;
+  const whose = data.images.length > 1 ? ", left image" : "";
+  $("histogram-title").textContent = `Histogram of ${titleOf(name).toLowerCase()}${whose}`;
   const [bar, across, tall] = sized($("bar"));
   for (let x = 0; x < across; x++) {
     const at = (x / across - low) / (high - low) * 255;
@@ -428,7 +429,7 @@ function showState() {
   $("scale").disabled = state.layer === "picture";
   $("low-value").textContent = show(valueAt(state.low, measured()));
   $("high-value").textContent = show(valueAt(state.high, measured()));
-  $("iso-value").textContent = Number(state.iso).toFixed(3);
+  $("iso-value").textContent = show(Number(state.iso.toPrecision(3)));
   const two = data.images.length > 1 && left() !== right();
   $("about").textContent = two ? `${left().about}  |  ${right().about}` : left().about;
   const dark = state.theme || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
@@ -614,6 +615,10 @@ async function begin() {
   for (const image of data.images) await load(image);
   if (!data.images.some((image) => image.planes.red)) START.layer = state.layer = "opacity";
   if (data.images.length < 2) START.right = state.right = 0;
+  // The slider of the line reaches as far as there is opacity: of a thin medium not far.
+  const most = Math.min(0.999, ends("opacity").high);
+  Object.assign($("iso"), { min: most / 1000, max: most, step: most / 1000 });
+  if (START.iso > most) START.iso = state.iso = Number((most / 2).toPrecision(3));
   restore();
   listen();
   new ResizeObserver(() => {
