@@ -225,6 +225,10 @@ WRONG = {
         "defaults = {density.file = 'ball.npz', output.image = '{frame}.png'}",
         "{frame} has no value",
     ),
+    "no image": (
+        "defaults = {density.file='ball.npz', output.image='a.gif'}",
+        "a.gif: must end in",
+    ),
     "open brace": ("defaults = {density.file = 'ball.npz', output.image = '{.png'}", "braces"),
     "orbit without frames": (BASE + "[orbit]\naxis = 'z'", "orbit.frames is missing"),
     "orbit of 0 frames": (BASE + "[orbit]\nframes = 0", "orbit.frames: .*greater than or equal"),

@@ -21,6 +21,7 @@ from volcli.batch.orbit import box_of, framing, is_framed, on_orbit
 from volcli.batch.schema import EXPANSIONS, Batch, Expansion
 from volcli.config import PATHS, from_folder, make_job, parse_setting, read_toml
 from volcli.errors import UsageError
+from volcli.images.paths import IMAGES
 from volcli.run import outputs
 from volcli.schema import Job
 from volcli.transforms import each_camera
@@ -212,12 +213,12 @@ def _sequence(job: Job, expansion: Expansion, name: str) -> tuple[list[Item], li
             raise UsageError(f"{name}: orbit.frames is missing; give the number of pictures")
         frames = frames or list(range(1, (orbit.frames or 0) + 1))
     if frames is None:
-        return [_item(one) for one in _each_camera(job, name)], notes
+        return [_item(one, name) for one in _each_camera(job, name)], notes
     jobs = [_at_frame(job, frame, name) for frame in frames]
     if is_framed(job.camera) or orbit is not None:
         jobs, said = _filmed(jobs, expansion)
         notes += said
-    return [_item(one) for made in jobs for one in each_camera(made)], notes
+    return [_item(one, name) for made in jobs for one in each_camera(made)], notes
 
 
 def _each_camera(job: Job, name: str) -> list[Job]:
@@ -279,9 +280,12 @@ def _named(job: Job, frame: int | None, where: str) -> Job:
     return job
 
 
-def _item(job: Job) -> Item:
+def _item(job: Job, where: str) -> Item:
     paths = {key: Path(os.path.abspath(path)) for key, path in paths_of(job).items()}  # noqa: PTH100
     job = with_paths(job, paths)
+    assert job.output.image is not None
+    if job.output.image.suffix.lower() not in IMAGES:
+        raise UsageError(f"{where}: {job.output.image.name}: must end in {' or '.join(IMAGES)}")
     inputs = [path for key, path in paths_of(job).items() if key != _OUTPUT]
     return Item(job, next((path for path in inputs if not path.exists()), None))
 
