@@ -7,10 +7,14 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 from batches import count, events, start, wait_until, write_batch, write_many
-from commandline import ROOT, SAMPLES, volcli
+from commandline import ROOT, SAMPLES, volcli, write_ball
 
+from volcli.batch.farm import Farm
+from volcli.batch.work import Limits, Task
+from volcli.config import load_job
 from volcli.images import read_exr
 
 pytest.importorskip("distributed", reason="the extra 'farm' is not installed")
@@ -145,6 +149,26 @@ def test_a_cluster_of_this_machine_survives_the_death_of_a_worker(tmp_path):
     assert "Traceback" not in err
     assert count(out, "done") == 60
     assert len(list(out.glob("*.png"))) == 60
+
+
+def test_a_worker_that_takes_more_than_its_memory_is_replaced_and_the_next_task_is_done(tmp_path):
+    zeros = np.zeros((500, 500, 500), np.float32)
+    zeros[1, 2, 3] = 1
+    np.savez_compressed(tmp_path / "large.npz", density=zeros)
+    write_ball(tmp_path / "ball.npz")
+    farm = Farm(None, 1, Limits(memory=480_000_000), lambda pid: None)
+    try:
+        errors = {}
+        for name in ("large", "ball"):
+            settings = [("output.image", tmp_path / f"{name}.png"), ("camera.resolution", (32, 24))]
+            farm.submit(Task(name, load_job(tmp_path / f"{name}.npz", settings)), alone=True)
+            while name not in errors:
+                errors |= {o.key: o.error for o in farm.wait(1.0)}
+    finally:
+        farm.close()
+    assert "ran out of memory" in errors["large"]
+    assert errors["ball"] is None
+    assert (tmp_path / "ball.png").exists() and not (tmp_path / "large.png").exists()
 
 
 def test_a_cluster_of_this_machine_ends_with_the_batch(tmp_path):

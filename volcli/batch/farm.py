@@ -29,6 +29,9 @@ _ANSWER_SECONDS, _FILE_SECONDS = 10, 60
 _LOOK_SECONDS = 1.0
 """How often it is asked which workers there are."""
 
+UNPAUSED = 0.7
+"""The part of its memory limit up to which a worker of dask surely goes on; it pauses at 0.8."""
+
 _worker: Worker | None = None
 _making = threading.Lock()
 
@@ -191,8 +194,15 @@ def _cluster(count: int, limits: Limits) -> Any:
     import dask
     from distributed import LocalCluster, Security
 
-    # Once a worker has died its tasks come back, and are tried again one by one.
-    with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
+    settings = {
+        # Once a worker has died its tasks come back, and are tried again one by one.
+        "distributed.scheduler.allowed-failures": 0,
+        # Nothing of ours can be spilt, and a pause would wait for grids that are kept.
+        "distributed.worker.memory.target": False,
+        "distributed.worker.memory.spill": False,
+        "distributed.worker.memory.pause": False,
+    }
+    with dask.config.set(settings):
         return LocalCluster(
             n_workers=count,
             threads_per_worker=AT_ONCE,
@@ -251,6 +261,8 @@ def _own(limits: Limits) -> Limits:
 
     worker = get_worker()
     memory = worker.memory_manager.memory_limit
+    if memory:
+        memory = int(UNPAUSED * memory)
     return Limits(
         threads=limits.threads or worker.state.nthreads,
         memory=limits.memory or memory,

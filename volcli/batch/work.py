@@ -172,15 +172,19 @@ class Worker:
         with self._changed:
             self._changed.wait_for(lambda: self._fits(needs))
             self._taken.append(needs)
-        if self._limits.memory is not None:
-            # What this task reads is among what it needs; what is left may stay for the next.
-            self._grids.shrink(max(0, self._limits.memory - PROCESS - sum(self._taken)))
+        self._leave_room()
         try:
             yield
         finally:
             with self._changed:
                 self._taken.remove(needs)
                 self._changed.notify_all()
+            self._leave_room()  # now: a worker of dask that holds too much is given no more tasks
+
+    def _leave_room(self) -> None:
+        """Keep no more grids than there is memory for beside what the tasks at hand need."""
+        if self._limits.memory is not None:
+            self._grids.shrink(max(0, self._limits.memory - PROCESS - sum(self._taken)))
 
     def _fits(self, needs: int) -> bool:
         if not self._taken:
