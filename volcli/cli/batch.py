@@ -110,7 +110,7 @@ def batch(
         bool, typer.Option("--quiet", "-q", help="No progress, and of jobs only the summary.")
     ] = False,
 ) -> None:
-    """Render many pictures: sequences, sweeps, turntables, lists of jobs.
+    """Render many pictures: sequences, sweeps, turntables.
 
     What is done is recorded in a manifest beside the pictures. A job that fails costs only itself
     (exit code 6 at the end), and --resume goes on after an interruption of any kind.
