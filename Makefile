@@ -30,6 +30,7 @@ bench: $(SETUP)
 	$(BIN)/python -m benchmarks.accuracy
 	$(BIN)/python -m pytest benchmarks/test_parts.py -q --benchmark-json benchmarks/results/parts.json
 	$(BIN)/python -m benchmarks.startup
+	$(BIN)/python -m benchmarks.inspect
 	$(BIN)/python -m benchmarks.load
 	$(BIN)/python -m benchmarks.render
 	$(BIN)/python -m benchmarks.peers
