@@ -10,6 +10,7 @@ from batches import count, write_batch, write_many
 from commandline import ROOT, SAMPLES, volcli, write_ball
 
 from volcli.batch.session import Tally
+from volcli.batch.work import Worker
 from volcli.cli.batch_output import Output
 from volcli.images import read_background, read_exr
 
@@ -17,10 +18,29 @@ pytestmark = pytest.mark.needs_jit
 BATCHES = sorted((ROOT / "configs" / "batch").glob("*.toml"))
 
 
+class Here:
+    """An engine that does the work itself; those that have others do it are tested elsewhere."""
+
+    def __init__(self, count, limits, on_start):
+        self.worker, self.tasks = Worker(limits), []
+
+    def has_room(self, alone):
+        return not self.tasks
+
+    def submit(self, task, alone):
+        self.tasks.append(task)
+
+    def wait(self, seconds):
+        return [self.worker.work(self.tasks.pop())]
+
+    def close(self):
+        pass
+
+
 @pytest.fixture(autouse=True)
-def plain_processes(monkeypatch):
-    """As without the extra: they start sooner."""
+def work_here(monkeypatch):
     monkeypatch.setattr("volcli.batch.farm.is_installed", lambda: False)
+    monkeypatch.setattr("volcli.batch.session.Processes", Here)
 
 
 @pytest.fixture
