@@ -244,7 +244,7 @@ def test_a_defect_of_volcli_itself_shows_where_it_is_and_asks_for_a_report(monke
     def fails(*_, **__):
         raise IndexError("index 8 is out of bounds\nfor axis 0")
 
-    monkeypatch.setattr("volcli.run.prepare", fails)
+    monkeypatch.setattr("volcli.run.prepare_each", fails)
     ran = volcli("render", SAMPLES / "rotated.vdb", "-o", tmp_path / "a.exr")
     assert ran.code == 1
     assert "Traceback" in ran.err
@@ -257,7 +257,7 @@ def test_memory_that_is_not_there_is_said_in_one_line(monkeypatch, tmp_path):
     def fails(*_, **__):
         raise MemoryError("Unable to allocate 8 TiB")
 
-    monkeypatch.setattr("volcli.run.prepare", fails)
+    monkeypatch.setattr("volcli.run.prepare_each", fails)
     ran = volcli("render", SAMPLES / "rotated.vdb", "-o", tmp_path / "a.exr")
     assert ran.code == 1
     assert "out of memory (Unable to allocate 8 TiB); a smaller picture" in ran.err
