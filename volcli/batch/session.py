@@ -5,8 +5,8 @@ The one way a batch is run; `volcli batch` calls it. It prints nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from volcli.batch.leftovers import remove_leftovers
 from volcli.batch.manifest import Manifest, Record
 from volcli.batch.processes import Processes
 from volcli.batch.runner import Engine, Runner, Settings, Told, Work
+from volcli.batch.tiles import windows
 from volcli.batch.work import Limits
 from volcli.errors import UsageError
 from volcli.render import available_threads
@@ -139,50 +140,72 @@ def run_batch(
                 f"{manifest.path}: is there from an earlier run; --resume does what is missing or "
                 "changed, --force does everything again"
             )
-        folders = [item.output.parent for item in expanded.items]
-        workers = list(manifest.former_workers())
-        remove_leftovers(folders, set(workers))
-        works = []
-        for item in _by_volume(expanded.items):
-            work = Work(item, job_hash(item.job), _needs(item, options.settings.tile))
-            files = run.outputs(item.job)
-            if not options.force and manifest.is_done(item.output, work.content, files):
-                tally.kept.append(item)
-            else:
-                works.append(work)
-        tally.total = len(expanded.items)
-        manifest.begin(len(works))
 
         def keep(told: Told) -> None:
             if told.event != "retry":
                 (tally.done if told.event == "done" else tally.failed).append(told)
             tell(told)
 
-        def started(pid: int) -> None:
-            workers.append(pid)
-            manifest.worker(pid)
-
+        works = _left_to_do(expanded.items, options, manifest, tally)
         memory = options.memory or int(MEMORY_SHARE * available_memory())
-        works, hopeless = _possible(works, None if options.scheduler else memory)
-        runner_tasks = sum(_tasks(work, options.settings.tile) for work in works)
-        tally.tasks = runner_tasks + len(hopeless)
+        possible, hopeless = _possible(works, None if options.scheduler else memory)
+        tile = options.settings.tile
+        tally.tasks = len(hopeless) + sum(
+            1 if tile is None else len(windows(work.item.job, tile)) for work in possible
+        )
+        manifest.begin(len(works))
         begin(tally)
         for work, reason in hopeless:
             manifest.failed(work.item.output, work.content, reason, attempt=0, again=False)
             keep(Told("failed", work, reason))
             advance(1)
-        for folder in set(folders):
-            with suppress(OSError):  # the job will say so
-                folder.mkdir(parents=True, exist_ok=True)
-        try:
-            for count, share in _phases(works, _workers(options, len(works)), memory, options):
+        with _swept_folders(expanded.items, manifest) as started:
+            for count, share in _phases(
+                possible, _workers(options, len(possible)), memory, options
+            ):
                 engine = _engine(options, count, memory, started, note)
                 try:
                     Runner(engine, manifest, options.settings, keep, advance).run(share)
                 finally:
                     engine.close()
-        finally:
-            remove_leftovers(folders, set(workers))
+
+
+def _left_to_do(
+    items: Sequence[Item], options: Options, manifest: Manifest, tally: Tally
+) -> list[Work]:
+    """The jobs that are not done as they are to be, those of one volume next to each other."""
+    tally.total = len(items)
+    works = []
+    for item in _by_volume(items):
+        content = job_hash(item.job)
+        if not options.force and manifest.is_done(item.output, content, run.outputs(item.job)):
+            tally.kept.append(item)
+        else:
+            works.append(Work(item, content, _needs(item, options.settings.tile)))
+    return works
+
+
+@contextmanager
+def _swept_folders(items: Sequence[Item], manifest: Manifest) -> Iterator[Callable[[int], None]]:
+    """The folders of all outputs, made, and swept before and after of what killed workers leave.
+
+    Gives what is to be told the process id of each worker.
+    """
+    folders = {item.output.parent for item in items}
+    workers = set(manifest.former_workers())
+
+    def started(pid: int) -> None:
+        workers.add(pid)
+        manifest.worker(pid)
+
+    remove_leftovers(folders, workers)
+    for folder in folders:
+        with suppress(OSError):  # the job will say so
+            folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield started
+    finally:
+        remove_leftovers(folders, workers)
 
 
 def _by_volume(items: Sequence[Item]) -> list[Item]:
@@ -195,13 +218,6 @@ def _by_volume(items: Sequence[Item]) -> list[Item]:
 
 def _needs(item: Item, tile: int | None) -> int:
     return estimate(item.job, None if tile is None else tile * tile) or 0
-
-
-def _tasks(work: Work, tile: int | None) -> int:
-    if tile is None:
-        return 1
-    width, height = work.item.job.camera.size
-    return -(-width // tile) * -(-height // tile)
 
 
 def _possible(
