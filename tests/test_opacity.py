@@ -170,6 +170,13 @@ def test_a_picture_that_is_wrong_says_why(tmp_path, name, tau, kind):
     assert kind in kinds(write_volcli_exr(tmp_path / f"{name}.exr", tau))
 
 
+def test_light_without_opacity_is_emission_and_not_nothing(tmp_path):
+    nothing = np.zeros((8, 8))
+    channels = {**dict.fromkeys("RGB", np.eye(8)), "A": nothing, "optical_depth.Y": nothing}
+    images.write_exr(tmp_path / "a.exr", channels, {})
+    assert kinds(tmp_path / "a.exr") == ["emission"]
+
+
 def test_a_picture_that_is_right_says_nothing(tmp_path):
     y, x = np.mgrid[-1:1:60j, -1:1:60j]
     tau = 3 * np.clip(0.8 - x * x - y * y, 0, None)

@@ -64,7 +64,16 @@ def _nonfinite(numbers: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _visibility(numbers: dict[str, Any]) -> list[tuple[str, str]]:
     """Empty, thin, solid, or black."""
+    colour = numbers["colour"]
     if not numbers["coverage"]["above_0"]:
+        light = colour["light_where_empty"] if colour and not colour["over_background"] else 0
+        if light:
+            return [
+                (
+                    "emission",
+                    f"opacity is 0 in every pixel, and {light:,} pixels have light: emission alone",
+                )
+            ]
         return [
             (
                 "empty",
@@ -97,7 +106,7 @@ def _visibility(numbers: dict[str, Any]) -> list[tuple[str, str]]:
                 f"tell; a smaller --density-scale shows what is inside",
             )
         )
-    colour, most_opaque = numbers["colour"], numbers["maps"]["opacity"]["max"]
+    most_opaque = numbers["maps"]["opacity"]["max"]
     if colour is not None and not colour["over_background"] and colour["max"] < 0.01 * most_opaque:
         found.append(
             (
