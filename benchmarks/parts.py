@@ -45,7 +45,7 @@ def count_segments(grid, support, eyes, d, buffer):
         t_near, t_far = clip(lo, hi, eye, d)
         ray = make_ray(move(eye, d, t_near, 0.0), d)
         t, t_far = 0.0, t_far - t_near
-        at = enter(grid, ray)
+        at = enter(grid, ray.o, ray.d)
         while t < t_far and inside(grid, at):
             t_exit, axis = root_exit(grid, ray, at)
             t_exit = min(t_exit, t_far)

@@ -9,6 +9,7 @@ from volcli.images import read_exr
 
 REAL = VOLUMES / "real"
 FILES = {
+    "density_and_heat": {"density.file": "density_and_heat.vdb"},
     "oiio_sphere_Cd": {"density.file": "oiio_sphere.vdb", "color.file": "oiio_sphere_Cd.vdb"},
 }
 
@@ -39,6 +40,23 @@ def picture(tmp_path):
         return read_exr(tmp_path / "a.exr")[0]
 
     return render
+
+
+@pytest.mark.needs_jit
+def test_the_flame_is_yellow_below_grey_smoke(picture):
+    channels = picture("density_and_heat")
+    rgb = np.stack([channels[c] for c in "RGB"], axis=-1)
+    y, x = np.unravel_index(rgb[..., 0].argmax(), rgb.shape[:2])
+    height, width = rgb.shape[:2]
+    assert 0.7 * height < y < 0.95 * height
+    assert 0.4 * width < x < 0.6 * width
+    assert rgb[y, x, 0] > 1 > rgb[y, x, 2]
+    assert rgb[y, x, 0] > 2 * rgb[y, x, 1] > 4 * rgb[y, x, 2]
+    smoke = rgb[height // 4 : height // 2][
+        channels["transmittance.Y"][height // 4 : height // 2] < 0.3
+    ]
+    assert len(smoke) > 20
+    np.testing.assert_allclose(smoke[:, 0] / smoke[:, 1], 1.0, atol=0.15)
 
 
 @pytest.mark.needs_jit

@@ -32,11 +32,11 @@ RULES = list(product([None, 1.0, 0.3], [False, True], [False, True]))
 def integrators(grid, step, nearest, depth, scale=1.0):
     """(packets, ray by ray) for one grid."""
     support = grid.support("nearest" if nearest else "linear")
-    density = Density(grid.arrays, grid.local_from_world, support, scale)
+    empty = grid.arrays.constants[0] == 0
+    density = Density(grid.arrays, grid.local_from_world, support, scale, bool(empty))
     options = {"step_voxels": step, "nearest": nearest, "depth": depth}
     return [
-        integrator.make_integrator(density, None, packets=packets, **options)
-        for packets in (True, False)
+        integrator.make_integrator(density, packets=packets, **options) for packets in (True, False)
     ]
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -141,7 +140,6 @@ def render(
     *,
     threads: int | None = None,
     window: Window | None = None,
-    on_compiled: Callable[[], None] | None = None,
     progress: Progress | None = None,
 ) -> RenderResult:
     """Render an image.
@@ -154,8 +152,6 @@ def render(
         Default: the processors that this process may use. The image does not depend on it.
     window
         The part of the image to render; its pixels are, to the bit, those of the whole image.
-    on_compiled
-        Called once the kernel is ready.
     progress
         Called with tiles done and tiles in all.
 
@@ -184,8 +180,6 @@ def render(
     nothing = np.empty((0, 3))
     integrate(nothing, nothing)  # compiles
     compiled = time.perf_counter()
-    if on_compiled is not None:
-        on_compiled()
 
     def one_tile(corner: tuple[int, int]) -> int:
         rows = slice(corner[0], min(corner[0] + edge, height))
@@ -288,26 +282,50 @@ def make_integrator(scene: Scene, plan: Plan) -> Integrator:
     """A function of (origins, directions) to (tau, radiance, distance, evaluations)."""
     from volcli.kernels import integrator
     from volcli.kernels.rays import Density
-    from volcli.kernels.source import Colour
+    from volcli.kernels.transfer import Transfer
 
-    grid = scene.density
+    grid, transfer = scene.density, scene.transfer
+    outside = float(grid.background if transfer is None else transfer.at(grid.background))
     interpolation = "nearest" if plan.nearest else "linear"
-    density = Density(
-        grid.arrays, grid.local_from_world, grid.support(interpolation), float(scene.scale)
-    )
-    colour = None
-    if isinstance(scene.color, Source):
-        source = scene.color.grid
-        same = np.array_equal(grid.world_from_index, source.world_from_index)
-        colour = Colour(
-            source.arrays,
-            source.local_from_world,
-            True if same else None,
-            grid.origin - source.origin,
-            source.brightest,
-        )
     return integrator.make_integrator(
-        density, colour, step_voxels=plan.step_voxels, nearest=plan.nearest, depth=plan.depth
+        Density(
+            grid.arrays,
+            grid.local_from_world,
+            grid.support(interpolation),
+            float(scene.scale),
+            outside == 0 and scene.emission is None,
+        ),
+        transfer=None if transfer is None else Transfer(transfer.knots, transfer.values),
+        colour=_kernel_source(scene.color, grid, interpolation),
+        emission=_kernel_source(scene.emission, grid, interpolation),
+        tint=scene.tint,
+        step_voxels=plan.step_voxels,
+        nearest=plan.nearest,
+        depth=plan.depth,
+    )
+
+
+def _kernel_source(
+    source: Source | tuple[float, float, float] | None, density: BrickGrid, interpolation: str
+) -> Any:
+    """A source as the kernels take it; None for a constant, which they need not know."""
+    from volcli.kernels.source import Source as KernelSource
+    from volcli.kernels.source import Table
+
+    if not isinstance(source, Source):
+        return None
+    grid, table = source.grid, source.table
+    brightest = source.scale * grid.brightest if table is None else float(table.colors.max())
+    same = np.array_equal(density.world_from_index, grid.world_from_index)
+    return KernelSource(
+        grid.arrays,
+        None if table is None else Table(table.knots, table.colors, table.kinks),
+        source.scale if table is None else None,
+        grid.local_from_world,
+        grid.support(interpolation),
+        True if same else None,
+        density.origin - grid.origin,
+        brightest,
     )
 
 

@@ -27,6 +27,9 @@ KNOTS = 1024
 luminance 1, from 100 to 3000 K, by 6e-4, where blue leaves sRGB.
 """
 
+KINK = 2e-3
+"""Where a table is a kink, and not a smooth curve in small pieces: see `ColorTable.kinks`."""
+
 MAP_KNOTS = 256
 """Knots of a named map: as many as matplotlib's own have colours."""
 
@@ -45,6 +48,17 @@ class ColorTable:
 
     knots: NDArray[np.float64]
     colors: NDArray[np.float64]
+
+    @property
+    def kinks(self) -> NDArray[np.float64]:
+        """(m,): the knots whose colour is off the line between their neighbours by more than
+        `KINK` of the brightest, ends included."""
+        before, after = self.knots[1:-1] - self.knots[:-2], self.knots[2:] - self.knots[1:-1]
+        share = (before / (before + after))[:, None]
+        line = self.colors[:-2] + share * (self.colors[2:] - self.colors[:-2])
+        ends = np.abs(np.diff(self.colors, axis=0)[[0, -1]])  # beyond them it is constant
+        off = np.vstack([ends[:1], np.abs(self.colors[1:-1] - line), ends[1:]]).max(axis=1)
+        return self.knots[off > KINK * np.abs(self.colors).max()]
 
     def at(self, values: ArrayLike) -> NDArray[np.float64]:
         """(...) values to (..., 3) colours."""

@@ -23,8 +23,8 @@ from volcli.kernels.cell import (
 from volcli.kernels.compiler import jit
 from volcli.kernels.lane_memory import gather, gather_square, load, scatter
 from volcli.kernels.lanes import LANES, any_of, floats, ints, numbers, pick, to_floats, to_ints
+from volcli.kernels.light import FADED
 from volcli.kernels.packet_walk import enter_cube, make_rays, nearest_plane, unpack
-from volcli.kernels.source import FADED
 from volcli.kernels.traversal import BRICK
 
 CORNER_ROW, STEP_ROW, FAR_ROW, SPEED_ROW, TAU_ROW, MOMENT_ROW, RAY_ROWS = 9, 12, 13, 14, 15, 16, 17
@@ -71,7 +71,7 @@ class Sums(NamedTuple):
     Attributes
     ----------
     tau, T, moment
-        FLOATS: as in `source.State`.
+        FLOATS: as in `light.State`.
     """
 
     tau: Any
@@ -135,8 +135,8 @@ def corners(atlas, at, mask):
 def add_cells(sums, p, scale, t, t_exit, mask, depth, t_far):
     """Add [t, t_exit] to the sums; p is the density's cubic about the middle.
 
-    Without depth only the optical depth is added; else see `source.add_span`, of which this is
-    the same for lanes. Light has faded (`source.faded`) where it has within the segment alone: then
+    Without depth only the optical depth is added; else see `light.add_span`, of which this is
+    the same for lanes. Light has faded (`light.faded`) where it has within the segment alone: then
     it has in the ray.
     """
     if depth is None:

@@ -173,11 +173,12 @@ def packet(rays, t_far, alive, density, step, nearest, depth, skip_background, b
 def integrate_packets(
     origins, directions, density, step_voxels, nearest, depth, optical_depth, buffer
 ):
-    """Integrate a batch of rays; parameters and result are those of `rays.integrate_rays`.
+    """Integrate a batch of rays; parameters and result are those of `rays.integrate_rays`, whose
+    terms that are missing here are out.
 
     ``buffer`` is a `packet_buffer`.
     """
-    skip_background = density.grid.constants[0] == 0.0
+    skip_background = density.skip_background
     m, box = density.local_from_world, density.support
     shift = 0.0 if nearest is None else 0.5
     evaluated = ints(0)

@@ -4,8 +4,8 @@ One call does a batch of rays, without the interpreter lock, on arrays that the 
 caller shares batches out among threads. A ray's result depends on nothing but the ray, so images
 are the same bit by bit for any number of threads.
 
-A term that a scene does not use is None (``colour``, ``depth``, ``step``, ``nearest``): numba
-compiles a version of the loop without it.
+A term that a scene does not use is None (``transfer``, ``colour``, ``emission``, ``tint``,
+``depth``, ``step``, ``nearest``): numba compiles a version of the loop without it.
 """
 
 from __future__ import annotations
@@ -17,13 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from volcli.kernels.compiler import jit, kernel
-from volcli.kernels.rules import exact_brick, exact_constant, midpoint_segment
-from volcli.kernels.source import State, refresh
+from volcli.kernels.light import State, refresh
+from volcli.kernels.rules import exact_segment, midpoint_segment
+from volcli.kernels.source import NOWHERE, Path
 from volcli.kernels.traversal import (
     clip,
     enter,
     inside,
     make_ray,
+    put,
     root_cell,
     root_exit,
     root_next,
@@ -37,19 +39,22 @@ class Density(NamedTuple):
     Attributes
     ----------
     grid
-        `BrickArrays` with one channel, values >= 0.
+        `BrickArrays` with one channel; values >= 0, but where there is a transfer function.
     local_from_world
         (3, 4) float64.
     support
         (2, 3) float64, local voxels: the box outside which nothing is integrated.
     scale
         Extinction per unit of density, 1 / world unit.
+    skip_background
+        Whether there is nothing where the grid is its background.
     """
 
     grid: Any
     local_from_world: NDArray[np.float64]
     support: NDArray[np.float64]
     scale: float
+    skip_background: bool
 
 
 @jit
@@ -69,12 +74,103 @@ def move(o, d, t, shift):
     return o[0] + t * d[0] + shift, o[1] + t * d[1] + shift, o[2] + t * d[2] + shift
 
 
+@jit
+def clip_to(box, o, d):
+    """`traversal.clip` to a box (2, 3); an interval that is empty is (inf, -inf)."""
+    lo, hi = (box[0, 0], box[0, 1], box[0, 2]), (box[1, 0], box[1, 1], box[1, 2])
+    t_near, t_far = clip(lo, hi, o, d)
+    if t_near < t_far:
+        return t_near, t_far
+    return math.inf, -math.inf
+
+
+@jit
+def path_of(source, origins, directions, n, t_start, shift, everywhere):
+    """`Path` of ray n through a source, distances counted from t_start."""
+    o = to_local(source.local_from_world, origins, n, 1.0)
+    d = to_local(source.local_from_world, directions, n, 0.0)
+    ray = make_ray(move(o, d, t_start, shift), d)
+    if everywhere:
+        return Path(ray, -math.inf, math.inf)
+    begin, end = clip_to(source.support, o, d)
+    return Path(ray, begin - t_start, end - t_start)
+
+
+@jit
+def add_segment(
+    state,
+    density,
+    entry,
+    corner,
+    ray,
+    t0,
+    t1,
+    step,
+    step_voxels,
+    t_far,
+    transfer,
+    colour,
+    emission,
+    tint,
+    nearest,
+    depth,
+    path,
+    emission_path,
+):
+    """Add one segment by the rule that was asked for: (state, evaluated)."""
+    grid, scale = density.grid, density.scale
+    if colour is not None or emission is not None or depth is not None:
+        state = refresh(state)
+    if step_voxels is not None:
+        return midpoint_segment(
+            state,
+            grid,
+            scale,
+            entry,
+            corner,
+            ray,
+            t0,
+            t1,
+            step,
+            t_far,
+            transfer,
+            colour,
+            emission,
+            tint,
+            nearest,
+            depth,
+            path,
+            emission_path,
+        )
+    return exact_segment(
+        state,
+        grid,
+        scale,
+        entry,
+        corner,
+        ray,
+        t0,
+        t1,
+        transfer,
+        colour,
+        emission,
+        tint,
+        nearest,
+        depth,
+        path,
+        emission_path,
+    )
+
+
 @kernel
 def integrate_rays(
     origins,
     directions,
     density,
+    transfer,
     colour,
+    emission,
+    tint,
     step_voxels,
     nearest,
     depth,
@@ -90,17 +186,25 @@ def integrate_rays(
         (n, 3) float64, world units; directions have length 1.
     density
         `Density`.
+    transfer
+        `transfer.Transfer`, density by the grid's value; or None: the value itself.
     colour
-        `source.Colour`, or None: radiance is then left alone (a constant colour needs no walk).
+        `source.Source`, or None: a constant colour needs no walk.
+    emission
+        `source.Source`, radiance per world unit; or None.
+    tint
+        (r, g, b) that extinction is multiplied by for each channel's light; or None.
     step_voxels
         Length of a step of the midpoint rule, in voxels; None: the exact rule.
     nearest
-        True for nearest-voxel interpolation of density and colour, None for trilinear.
+        True for nearest-voxel interpolation of all grids, None for trilinear.
     depth
         (n,) float64, written: the expected distance to a hit, +inf where nothing can be hit; or
-        None.
-    optical_depth, radiance
-        (n,) and (n, 3) float64, written.
+        None. A tint has no part in it.
+    optical_depth
+        (n,) float64, written: without the tint.
+    radiance
+        (n, 3) float64, written where there is colour or emission; else left alone.
     buffer
         `traversal.segment_buffer`, room for the work of one thread.
 
@@ -109,9 +213,6 @@ def integrate_rays(
     Cells (or samples, for the midpoint rule) evaluated.
     """
     grid = density.grid
-    skip_background = grid.constants[0] == 0.0
-    box = density.support
-    lo, hi = (box[0, 0], box[0, 1], box[0, 2]), (box[1, 0], box[1, 1], box[1, 2])
     # With nearest, voxel (i, j, k) is the unit cube around its lattice point: half a voxel's
     # shift makes it the cell (i, j, k).
     shift = 0.0 if nearest is None else 0.5
@@ -119,85 +220,73 @@ def integrate_rays(
     for n in range(len(origins)):
         eye = to_local(density.local_from_world, origins, n, 1.0)
         d = to_local(density.local_from_world, directions, n, 0.0)
-        t_near, t_far = clip(lo, hi, eye, d)
-        ray = make_ray(move(eye, d, t_near, shift), d)
-        t_far -= t_near
-        colour_ray = ray
-        if colour is not None:
-            colour_d = to_local(colour.local_from_world, directions, n, 0.0)
-            eye = to_local(colour.local_from_world, origins, n, 1.0)
-            colour_ray = make_ray(move(eye, colour_d, t_near, shift), colour_d)
-        step = 0.0
-        if step_voxels is not None:
-            step = step_voxels / math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+        begin, end = clip_to(density.support, eye, d)
+        t_near, t_far = begin, end
+        if emission is not None:
+            o = to_local(emission.local_from_world, origins, n, 1.0)
+            to = to_local(emission.local_from_world, directions, n, 0.0)
+            emission_begin, emission_end = clip_to(emission.support, o, to)
+            t_near, t_far = min(t_near, emission_begin), max(t_far, emission_end)
+        state = State(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, t_far - t_near)
+        if t_near < t_far:
+            t_far -= t_near
+            begin = min(begin - t_near, t_far)
+            ray = make_ray(move(eye, d, t_near, shift), d)
+            path = emission_path = Path(ray, -math.inf, math.inf)
+            if colour is not None:
+                path = path_of(colour, origins, directions, n, t_near, shift, True)
+            if emission is not None:
+                emission_path = path_of(emission, origins, directions, n, t_near, shift, False)
+            step = 0.0
+            if step_voxels is not None:
+                step = step_voxels / math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
 
-        state = State(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, t_far)
-        at = enter(grid, ray)
-        t = 0.0
-        while t < t_far and inside(grid, at):
-            t_exit, axis = root_exit(grid, ray, at)
-            t_exit = min(t_exit, t_far)
-            buffer.used[0] = 0
-            if t_exit > t:
-                entry, corner = root_cell(grid, at)
-                root_segments(grid, skip_background, entry, corner, ray, t, t_exit, buffer)
-                t = t_exit
-            for s in range(buffer.used[0]):
-                t0, t1 = buffer.times[s, 0], buffer.times[s, 1]
-                entry = int(buffer.entries[s])
-                corner = (buffer.corners[s, 0], buffer.corners[s, 1], buffer.corners[s, 2])
-                if colour is not None or depth is not None:
-                    state = refresh(state)
-                if step_voxels is not None:
-                    state, cells = midpoint_segment(
+            t = 0.0
+            end = max(end - t_near, begin)
+            at = enter(grid, move(ray.o, d, begin, 0.0), d)
+            while t < t_far:
+                buffer.used[0] = 0
+                if t < begin:  # before the density's box there is emission at most
+                    put(buffer, t, begin, NOWHERE, 0, 0, 0)
+                    t = begin
+                elif t < end and inside(grid, at):
+                    t_exit, axis = root_exit(grid, ray, at)
+                    t_exit = min(t_exit, end)
+                    if t_exit > t:
+                        entry, corner = root_cell(grid, at)
+                        skip = density.skip_background
+                        root_segments(grid, skip, entry, corner, ray, t, t_exit, buffer)
+                        t = t_exit
+                    at = root_next(ray, at, axis)
+                else:  # and so behind it
+                    if emission is not None:
+                        put(buffer, t, t_far, NOWHERE, 0, 0, 0)
+                    t = t_far
+                for s in range(buffer.used[0]):
+                    state, cells = add_segment(
                         state,
-                        grid,
-                        density.scale,
-                        entry,
-                        corner,
+                        density,
+                        int(buffer.entries[s]),
+                        (buffer.corners[s, 0], buffer.corners[s, 1], buffer.corners[s, 2]),
                         ray,
-                        t0,
-                        t1,
+                        buffer.times[s, 0],
+                        buffer.times[s, 1],
                         step,
+                        step_voxels,
                         t_far,
+                        transfer,
                         colour,
+                        emission,
+                        tint,
                         nearest,
                         depth,
-                        colour_ray,
+                        path,
+                        emission_path,
                     )
-                elif entry < 0:
-                    value = np.float64(grid.constants[-1 - entry])
-                    state, cells = exact_constant(
-                        state,
-                        value,
-                        density.scale,
-                        t0,
-                        t1,
-                        colour,
-                        nearest,
-                        depth,
-                        colour_ray,
-                    )
-                else:
-                    state, cells = exact_brick(
-                        state,
-                        grid,
-                        density.scale,
-                        entry,
-                        corner,
-                        ray,
-                        t0,
-                        t1,
-                        colour,
-                        nearest,
-                        depth,
-                        colour_ray,
-                    )
-                evaluated += cells
-            at = root_next(ray, at, axis)
+                    evaluated += cells
 
         optical_depth[n] = state.tau
-        if colour is not None:
+        if colour is not None or emission is not None:
             radiance[n, 0] = state.r
             radiance[n, 1] = state.g
             radiance[n, 2] = state.b

@@ -10,34 +10,60 @@ import math
 
 import numpy as np
 
-from volcli.kernels.cell import absorbed, cubic, integral, load, trilinear
+from volcli.kernels.cell import absorbed, antiderivative, cubic, integral, load, trilinear
 from volcli.kernels.compiler import jit
-from volcli.kernels.source import (
-    State,
-    add_span,
-    add_spans,
-    colour_at,
-    colour_cell,
-    darken,
-    faded,
-)
+from volcli.kernels.light import State, add_spans, darken, faded
+from volcli.kernels.source import NOWHERE, WALK, source_at, source_cell
+from volcli.kernels.transfer import linear_piece, transferred
 from volcli.kernels.traversal import advance, brick_entry, start_all
 
 
 @jit
-def exact_brick(state, grid, scale, brick, corner, ray, t0, t1, colour, nearest, depth, colour_ray):
-    """Walk the brick with lowest voxel ``corner`` cell by cell; optical depth is exact in each.
+def own_cell(source, entry, x, y, z):
+    """(entry, i, j, k): the source's brick and lowest local voxel for the density's brick at
+    (x, y, z), if the two share a lattice; else an entry of `NOWHERE`."""
+    if source is None:
+        return NOWHERE, 0, 0, 0
+    i, j, k = x + source.shift[0], y + source.shift[1], z + source.shift[2]
+    own = NOWHERE
+    if source.same_lattice is not None and entry >= 0:
+        own = brick_entry(source.grid, i, j, k)[0]
+    return own, i, j, k
+
+
+@jit
+def exact_segment(
+    state,
+    grid,
+    scale,
+    entry,
+    corner,
+    ray,
+    t0,
+    t1,
+    transfer,
+    colour,
+    emission,
+    tint,
+    nearest,
+    depth,
+    path,
+    emission_path,
+):
+    """Walk a segment cell by cell; optical depth is exact in each. A constant is one cell.
 
     With ``nearest`` a cell has one value.
     """
     x, y, z = corner
     i, j, k, tx, ty, tz, sx, sy, sz, ddx, ddy, ddz = start_all(ray, t0, x, y, z, 1.0, 8.0)
     dx, dy, dz = ray.d
-    lit = (colour is not None or depth is not None) and not faded(state, colour, depth)
-    colour_entry, cx, cy, cz = 0, 0, 0, 0
-    if colour is not None and colour.same_lattice is not None:
-        cx, cy, cz = x + colour.shift[0], y + colour.shift[1], z + colour.shift[2]
-        colour_entry = brick_entry(colour.grid, cx, cy, cz)[0]
+    if entry < 0:
+        i, j, k, tx, ty, tz = 0, 0, 0, math.inf, math.inf, math.inf
+    lit = False
+    if colour is not None or emission is not None or depth is not None:
+        lit = not faded(state, colour, emission, tint, depth)
+    own, cx, cy, cz = own_cell(colour, entry, x, y, z)
+    emission_own, ex, ey, ez = own_cell(emission, entry, x, y, z)
     cells = 0
     t = t0
     while True:
@@ -45,23 +71,37 @@ def exact_brick(state, grid, scale, brick, corner, ray, t0, t1, colour, nearest,
         if t_exit > t:
             cells += 1
             tm = 0.5 * (t + t_exit)
-            if nearest is not None:
-                p = (np.float64(grid.atlas[brick, (i * 9 + j) * 9 + k]), 0.0, 0.0, 0.0)
+            if entry < 0:
+                p = (constant_density(grid, entry, transfer), 0.0, 0.0, 0.0)
+            elif nearest is not None:
+                value = np.float64(grid.atlas[entry, (i * 9 + j) * 9 + k])
+                p = (transferred(transfer, value), 0.0, 0.0, 0.0)
             else:
                 px = ray.o[0] + tm * dx - (x + i)
                 py = ray.o[1] + tm * dy - (y + j)
                 pz = ray.o[2] + tm * dz - (z + k)
-                p = cubic(load(grid.atlas, brick, i, j, k), px, py, pz, dx, dy, dz)
-            if not lit:
+                p = cubic(load(grid.atlas, entry, i, j, k), px, py, pz, dx, dy, dz)
+            if not lit and transfer is None:
                 state = darken(state, scale * integral(p, t_exit - t))
-            elif colour is not None and colour.same_lattice is None:
-                state = add_spans(
-                    state, p, scale, tm, t, t_exit, colour, nearest, depth, colour_ray
-                )
             else:
-                cell = (colour_entry, cx + i, cy + j, cz + k)
-                state = add_span(
-                    state, p, scale, tm, t, t_exit, colour, nearest, depth, cell, colour_ray
+                state = add_cell(
+                    state,
+                    p,
+                    scale,
+                    t,
+                    t_exit,
+                    transfer,
+                    entry < 0 or nearest is not None,
+                    colour,
+                    emission,
+                    tint,
+                    nearest,
+                    depth,
+                    lit,
+                    (own, cx + i, cy + j, cz + k),
+                    path,
+                    (emission_own, ex + i, ey + j, ez + k),
+                    emission_path,
                 )
             t = t_exit
         if t_exit >= t1:
@@ -72,25 +112,75 @@ def exact_brick(state, grid, scale, brick, corner, ray, t0, t1, colour, nearest,
 
 
 @jit
-def exact_constant(state, density, scale, t0, t1, colour, nearest, depth, colour_ray):
-    """A region of one density, in closed form (where colour varies, a colour cell at a time)."""
-    p = (density, 0.0, 0.0, 0.0)
-    tm = 0.5 * (t0 + t1)
-    if (colour is None and depth is None) or faded(state, colour, depth):
-        state = darken(state, scale * density * (t1 - t0))
-    elif colour is not None:
-        state = add_spans(state, p, scale, tm, t0, t1, colour, nearest, depth, colour_ray)
-    else:
-        cell = (0, 0, 0, 0)
-        state = add_span(state, p, scale, tm, t0, t1, colour, nearest, depth, cell, colour_ray)
-    return state, 1
+def constant_density(grid, entry, transfer):
+    """The density where the grid is a constant; 0 where it is nothing at all."""
+    if entry == NOWHERE:
+        return 0.0
+    return transferred(transfer, np.float64(grid.constants[-1 - entry]))
 
 
 @jit
-def density_at(grid, entry, corner, ray, t, nearest):
-    """The density at distance t, in a brick with lowest voxel ``corner`` or in a constant."""
-    if entry < 0:
-        return np.float64(grid.constants[-1 - entry])
+def add_cell(
+    state,
+    p,
+    scale,
+    t0,
+    t1,
+    transfer,
+    settled,
+    colour,
+    emission,
+    tint,
+    nearest,
+    depth,
+    lit,
+    own,
+    path,
+    emission_own,
+    emission_path,
+):
+    """Add [t0, t1], over which ``p`` is the cubic of the grid's values about the middle, to the
+    state: piece by piece of the transfer function, if there is one and p is not density already
+    (``settled``).
+
+    Unless ``lit``, only its optical depth counts.
+    """
+    tm = 0.5 * (t0 + t1)
+    t = t0
+    while t < t1:
+        t_exit, q = t1, p
+        if transfer is not None and not settled:
+            u, q = linear_piece(p, t - tm, t1 - tm, transfer)
+            if u < t1 - tm:
+                t_exit = max(tm + u, np.nextafter(t, math.inf))
+        if lit:
+            state = add_spans(
+                state,
+                q,
+                scale,
+                tm,
+                t,
+                t_exit,
+                colour,
+                emission,
+                tint,
+                nearest,
+                depth,
+                own,
+                path,
+                emission_own,
+                emission_path,
+            )
+        else:
+            tau = scale * (antiderivative(q, t_exit - tm) - antiderivative(q, t - tm))
+            state = darken(state, max(0.0, tau))
+        t = t_exit
+    return state
+
+
+@jit
+def value_in(grid, entry, corner, ray, t, nearest):
+    """The grid's value at distance t, in a brick with lowest voxel ``corner``."""
     x = ray.o[0] + t * ray.d[0] - corner[0]
     y = ray.o[1] + t * ray.d[1] - corner[1]
     z = ray.o[2] + t * ray.d[2] - corner[2]
@@ -114,10 +204,14 @@ def midpoint_segment(
     t1,
     step,
     t_far,
+    transfer,
     colour,
+    emission,
+    tint,
     nearest,
     depth,
-    colour_ray,
+    path,
+    emission_path,
 ):
     """The digest's piecewise-constant rule: the samples of the ray that lie in [t0, t1).
 
@@ -136,19 +230,65 @@ def midpoint_segment(
         if t >= t1:
             break
         samples += 1
-        tau = scale * density_at(grid, entry, corner, ray, t, nearest) * length
-        if (colour is None and depth is None) or faded(state, colour, depth):
+        if entry < 0:
+            density = constant_density(grid, entry, transfer)
+        else:
+            density = transferred(transfer, value_in(grid, entry, corner, ray, t, nearest))
+        tau = scale * density * length
+        if (colour is None and emission is None and depth is None) or faded(
+            state, colour, emission, tint, depth
+        ):
             state = darken(state, tau)
             continue
         hit = state.T * absorbed(tau)
         _, T, r, g, b, moment, _ = state
         if colour is not None and hit > 0.0:
-            cell = colour_cell(colour, colour_ray, t, t_far)[1]
-            cr, cg, cb = colour_at(colour, nearest, cell, colour_ray, t)
-            r += hit * cr
-            g += hit * cg
-            b += hit * cb
+            cell = source_cell(colour, WALK, path, t, t_far)[1]
+            cr, cg, cb = source_at(colour, nearest, cell, path.ray, t)
+            hr, hg, hb = hits(state, tau, hit, tint)
+            r += hr * cr
+            g += hg * cg
+            b += hb * cb
+        if emission is not None:
+            cell = source_cell(emission, WALK, emission_path, t, t_far)[1]
+            er, eg, eb = source_at(emission, nearest, cell, emission_path.ray, t)
+            lr, lg, lb = reaches(state, tau, tint)
+            r += length * lr * er
+            g += length * lg * eg
+            b += length * lb * eb
         if depth is not None:
             moment += hit * t
         state = State(state.tau + tau, T - hit, r, g, b, moment, t_far)
     return state, samples
+
+
+@jit
+def hits(state, tau, hit, tint):
+    """The probability, by channel, of the first hit in a step of optical depth tau."""
+    if tint is None:
+        return hit, hit, hit
+    return (
+        math.exp(-tint[0] * state.tau) * absorbed(tint[0] * tau),
+        math.exp(-tint[1] * state.tau) * absorbed(tint[1] * tau),
+        math.exp(-tint[2] * state.tau) * absorbed(tint[2] * tau),
+    )
+
+
+@jit
+def reaches(state, tau, tint):
+    """The mean transmittance, by channel, over a step of optical depth tau and constant extinction:
+    T (1 - exp(-tau)) / tau."""
+    if tint is None:
+        mean = state.T * mean_transmittance(tau)
+        return mean, mean, mean
+    return (
+        math.exp(-tint[0] * state.tau) * mean_transmittance(tint[0] * tau),
+        math.exp(-tint[1] * state.tau) * mean_transmittance(tint[1] * tau),
+        math.exp(-tint[2] * state.tau) * mean_transmittance(tint[2] * tau),
+    )
+
+
+@jit
+def mean_transmittance(tau):
+    """(1 - exp(-tau)) / tau, 1 at 0."""
+    return absorbed(tau) / tau if tau > 0.0 else 1.0

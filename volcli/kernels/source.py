@@ -1,13 +1,7 @@
-"""What a ray sees of a source of radiance: spans of the ray, sampled and weighted.
+"""Sources of colour and of emission: what they are at a point of a ray.
 
-A span is a part of the ray over which density is one cubic and colour is one cell of its own
-lattice. Each span adds ``T (1 - exp(-tau)) sum_i w_i c(t_i)``, with the weights of
-`cell.hit_weights`; the expected hit distance is the same sum with c = t. The colour grid may lie on
-another lattice than the density: then a density cell is cut where the ray crosses the planes of
-that lattice, and the rule keeps its order.
-
-``colour`` and ``depth`` are None where the scene has no such term; numba compiles a version without
-it.
+A source is a grid of three channels, or of one and a table of the colours of its values. It may lie
+on another lattice than the density.
 """
 
 from __future__ import annotations
@@ -18,92 +12,129 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from volcli.kernels.cell import (
-    MAX_TAU,
-    SHORTEST,
-    absorbed,
-    antiderivative,
-    hit_weights,
-    trilinear,
-)
+from volcli.kernels.cell import cubic, trilinear
 from volcli.kernels.compiler import jit
-from volcli.kernels.traversal import brick_entry
+from volcli.kernels.crossing import first_crossing
+from volcli.kernels.traversal import brick_entry, last_below
 
-FADED = 2.0**-24
-"""What is less than this part of a number cannot change it in float32."""
+NOWHERE = -(2**30)
+"""In place of an entry: neither a brick nor a constant, but nothing at all."""
 
-STOP_TAU = -math.log(FADED)
-"""The optical depth beyond which T < FADED."""
+WALK = (NOWHERE, 0, 0, 0)
+"""In place of a cell: none that is known beforehand."""
 
 
-class State(NamedTuple):
-    """What is known of a ray up to some distance.
+class Table(NamedTuple):
+    """The colour of a value: piecewise linear, constant beyond the ends.
 
     Attributes
     ----------
-    tau
-        Optical depth.
-    T
-        Transmittance, exp(-tau): kept up within a brick, taken afresh from tau at the next.
-    r, g, b
-        Radiance.
-    moment
-        The integral of t T sigma dt, for the expected hit distance.
-    t_far
-        Where the ray leaves the volume: no hit is farther.
+    knots
+        (k,) float64, ascending.
+    colours
+        (k, 3) float64.
+    kinks
+        (m,) float64, ascending: values at which the colour turns sharply. Gauss' rule is off across
+        them, so spans end there.
     """
 
-    tau: float
-    T: float
-    r: float
-    g: float
-    b: float
-    moment: float
-    t_far: float
+    knots: NDArray[np.float64]
+    colours: NDArray[np.float64]
+    kinks: NDArray[np.float64]
 
 
-class Colour(NamedTuple):
-    """A colour grid beside a density grid.
+class Source(NamedTuple):
+    """A grid of colour, or of emission, beside a density grid.
 
     Attributes
     ----------
     grid
-        `BrickArrays` with three channels.
+        `BrickArrays` with three channels; with a table, with one.
+    table
+        `Table`, or None.
+    scale
+        What the channels are multiplied by; None with a table.
     local_from_world
         (3, 4) float64.
+    support
+        (2, 3) float64, local voxels: the box outside which there is no emission. (Colour is the
+        grid's background there.)
     same_lattice
         True, or None when its lattice is another than the density's.
     shift
-        (3,) int64: local voxel of the colour grid minus that of the density; of use on the same
-        lattice only.
+        (3,) int64: local voxel of this grid minus that of the density; of use on the same lattice
+        only.
     brightest
-        The largest magnitude in the grid: no light that is still to come is brighter.
+        The largest magnitude of any channel: no light that is still to come is brighter.
     """
 
     grid: Any
+    table: Any
+    scale: Any
     local_from_world: NDArray[np.float64]
+    support: NDArray[np.float64]
     same_lattice: Any
     shift: NDArray[np.int64]
     brightest: float
 
 
+class Path(NamedTuple):
+    """A ray as a source sees it.
+
+    Attributes
+    ----------
+    ray
+        `traversal.Ray`, in local voxels of the source.
+    begin, end
+        Distances between which there is a source at all.
+    """
+
+    ray: Any
+    begin: float
+    end: float
+
+
 @jit
-def colour_cell(colour, ray, t, t_end):
-    """The colour cell that the ray is in just after t, and where the ray leaves it.
+def source_cell(source, own, path, t, t_end):
+    """The cell of a source that the ray is in just after t, and where the ray leaves it.
 
     Returns (t_exit, cell): cell is (entry, i, j, k), a brick and the local voxel of the cell, or a
-    constant, and then t_exit is where the ray leaves the cube that it fills. ``ray`` is in voxels
-    of the colour grid.
+    constant, and then t_exit is where the ray leaves the cube that it fills; or `NOWHERE`. ``own``
+    is the cell that is known to reach up to t_end, or `WALK` if none is.
     """
-    i, tx = cell_after(ray, 0, t, 1)
-    j, ty = cell_after(ray, 1, t, 1)
-    k, tz = cell_after(ray, 2, t, 1)
-    entry, width = brick_entry(colour.grid, i, j, k)
+    if t < path.begin:
+        return min(path.begin, t_end), (NOWHERE, 0, 0, 0)
+    if t >= path.end:
+        return t_end, (NOWHERE, 0, 0, 0)
+    t_end = min(path.end, t_end)
+    if own[0] != NOWHERE:
+        return t_end, own
+    i, tx = cell_after(path.ray, 0, t, 1)
+    j, ty = cell_after(path.ray, 1, t, 1)
+    k, tz = cell_after(path.ray, 2, t, 1)
+    entry, width = brick_entry(source.grid, i, j, k)
     if entry < 0:
-        tx = cell_after(ray, 0, t, width)[1]
-        ty = cell_after(ray, 1, t, width)[1]
-        tz = cell_after(ray, 2, t, width)[1]
+        tx = cell_after(path.ray, 0, t, width)[1]
+        ty = cell_after(path.ray, 1, t, width)[1]
+        tz = cell_after(path.ray, 2, t, width)[1]
     return min(min(tx, ty), min(tz, t_end)), (entry, i, j, k)
+
+
+@jit
+def kink_exit(grid, table, nearest, cell, ray, t, t_exit):
+    """Where, up to t_exit, a ray in a cell of a source comes to a kink of its table, at the
+    latest."""
+    if table is not None and nearest is None:
+        entry, i, j, k = cell
+        if entry >= 0 and len(table.kinks) > 0:
+            d = ray.d
+            x, y, z = ray.o[0] + t * d[0] - i, ray.o[1] + t * d[1] - j, ray.o[2] + t * d[2] - k
+            v = scalars(grid.atlas, entry, ((i & 7) * 9 + (j & 7)) * 9 + (k & 7))
+            p = cubic(v, x, y, z, d[0], d[1], d[2])
+            to = first_crossing(p, 0.0, t_exit - t, table.kinks)[0]
+            if to < t_exit - t:
+                return max(t + to, np.nextafter(t, math.inf))
+    return t_exit
 
 
 @jit
@@ -128,32 +159,61 @@ def cell_after(ray, axis, t, width):
 
 
 @jit
-def colour_at(colour, nearest, cell, ray, t):
-    """(r, g, b) at distance t, in a cell (entry, i, j, k) of the colour grid."""
+def source_at(source, nearest, cell, ray, t):
+    """(r, g, b) at distance t, in a cell (entry, i, j, k) of a source."""
+    if cell[0] == NOWHERE:
+        return 0.0, 0.0, 0.0
     entry, i, j, k = cell
-    if entry < 0:
-        constants = colour.grid.constants
-        at = -1 - entry
-        return (
-            np.float64(constants[at, 0]),
-            np.float64(constants[at, 1]),
-            np.float64(constants[at, 2]),
-        )
-    atlas = colour.grid.atlas
-    b = ((i & 7) * 9 + (j & 7)) * 9 + (k & 7)
-    if nearest is not None:
-        return (
-            np.float64(atlas[entry, b, 0]),
-            np.float64(atlas[entry, b, 1]),
-            np.float64(atlas[entry, b, 2]),
-        )
+    first = ((i & 7) * 9 + (j & 7)) * 9 + (k & 7)
     x = ray.o[0] + t * ray.d[0] - i
     y = ray.o[1] + t * ray.d[1] - j
     z = ray.o[2] + t * ray.d[2] - k
+    return colour_in(source.grid, source.table, source.scale, nearest, entry, first, x, y, z)
+
+
+@jit
+def colour_in(grid, table, scale, nearest, entry, first, x, y, z):
+    """(r, g, b) at (x, y, z) in the cell whose first corner is value ``first`` of a brick, or in a
+    constant.
+
+    ``scale`` is None with a table and ``table`` without: numba compiles what an argument that is
+    None leaves.
+    """
+    atlas, constants = grid.atlas, grid.constants
+    r = g = b = 0.0
+    if table is not None:
+        if entry < 0:
+            value = np.float64(constants[-1 - entry])
+        elif nearest is not None:
+            value = np.float64(atlas[entry, first])
+        else:
+            value = trilinear(scalars(atlas, entry, first), x, y, z)
+        r, g, b = table_colour(table, value)
+    if scale is not None:
+        if entry < 0:
+            at = -1 - entry
+            r, g, b = constants[at, 0], constants[at, 1], constants[at, 2]
+        elif nearest is not None:
+            r, g, b = atlas[entry, first, 0], atlas[entry, first, 1], atlas[entry, first, 2]
+        else:
+            r = channel(atlas, entry, first, 0, x, y, z)
+            g = channel(atlas, entry, first, 1, x, y, z)
+            b = channel(atlas, entry, first, 2, x, y, z)
+        r, g, b = scale * r, scale * g, scale * b
+    return r, g, b
+
+
+@jit
+def table_colour(table, value):
+    """(r, g, b) of a value."""
+    knots, colours = table.knots, table.colours
+    low = min(max(last_below(knots, value), 0), len(knots) - 2)
+    share = (value - knots[low]) / (knots[low + 1] - knots[low])
+    share = min(max(share, 0.0), 1.0)
     return (
-        channel(atlas, entry, b, 0, x, y, z),
-        channel(atlas, entry, b, 1, x, y, z),
-        channel(atlas, entry, b, 2, x, y, z),
+        colours[low, 0] + share * (colours[low + 1, 0] - colours[low, 0]),
+        colours[low, 1] + share * (colours[low + 1, 1] - colours[low, 1]),
+        colours[low, 2] + share * (colours[low + 1, 2] - colours[low, 2]),
     )
 
 
@@ -174,97 +234,15 @@ def channel(atlas, brick, b, c, x, y, z):
 
 
 @jit
-def add_span(state, p, scale, tm, t0, t1, colour, nearest, depth, cell, ray):
-    """Add the light of [t0, t1] to the state.
-
-    ``p`` is the density's cubic about the distance ``tm``; ``cell`` is the colour's, and ``ray`` is
-    in voxels of the colour grid. A span of optical depth above `MAX_TAU` is added in parts, each
-    half or twice as long as the one before, or the same, so that none is above.
-    """
-    u, end = t0 - tm, t1 - tm
-    begin = antiderivative(p, u)
-    whole = max(0.0, scale * (antiderivative(p, end) - begin))
-    if whole <= 0.0:
-        return state
-    _, T, r, g, b, moment, t_far = state
-    shortest = (end - u) * SHORTEST
-    length = end - u
-    tau = state.tau
-    while u < end:
-        to = min(u + length, end)
-        if scale * (antiderivative(p, to) - begin) > MAX_TAU and length > shortest:
-            length *= 0.5
-            continue
-        part, at, w = hit_weights(p, scale, u, to)
-        hit = T * absorbed(part)
-        T -= hit
-        if colour is not None:
-            for n in range(4):
-                cr, cg, cb = colour_at(colour, nearest, cell, ray, tm + at[n])
-                r += hit * w[n] * cr
-                g += hit * w[n] * cg
-                b += hit * w[n] * cb
-        if depth is not None:
-            mean = at[0] * w[0] + at[1] * w[1] + at[2] * w[2] + at[3] * w[3]
-            moment += hit * (tm + mean)
-        tau += part
-        if faded(State(tau, T, r, g, b, moment, t_far), colour, depth):
-            break
-        u = to
-        begin = antiderivative(p, u)
-        length *= 2.0
-    return State(state.tau + whole, T, r, g, b, moment, t_far)
-
-
-@jit
-def add_spans(state, p, scale, tm, t0, t1, colour, nearest, depth, ray):
-    """As `add_span`, cut where the ray crosses the planes of the colour's own lattice."""
-    t = t0
-    while t < t1:
-        if faded(state, colour, depth):
-            rest = antiderivative(p, t1 - tm) - antiderivative(p, t - tm)
-            return darken(state, max(0.0, scale * rest))
-        t_exit, cell = colour_cell(colour, ray, t, t1)
-        state = add_span(state, p, scale, tm, t, t_exit, colour, nearest, depth, cell, ray)
-        t = t_exit
-    return state
-
-
-@jit
-def faded(state, colour, depth):
-    """Whether light that is still to come is less than 2^-24 of what the ray's brightest channel
-    has seen (and distance likewise): then only optical depth goes on.
-
-    T alone does not tell: what is behind may be brighter than what is in front.
-    """
-    if state.tau <= STOP_TAU:
-        return False
-    T = math.exp(-state.tau)
-    if colour is not None:
-        seen = max(abs(state.r), max(abs(state.g), abs(state.b)))
-        if T * colour.brightest > FADED * seen:
-            return False
-    return depth is None or T * state.t_far <= FADED * state.moment
-
-
-@jit
-def darken(state, tau):
-    """The state after an optical depth of tau whose light is not asked for, or too weak to count.
-
-    T is left behind: it is taken afresh from tau before it is used again.
-    """
-    return State(state.tau + tau, state.T, state.r, state.g, state.b, state.moment, state.t_far)
-
-
-@jit
-def refresh(state):
-    """The state with T taken from tau, so that no product of many factors builds up."""
-    return State(
-        state.tau,
-        math.exp(-state.tau),
-        state.r,
-        state.g,
-        state.b,
-        state.moment,
-        state.t_far,
+def scalars(atlas, brick, b):
+    """The corners of the cell of a brick whose first is value b, in a grid of one channel."""
+    return (
+        np.float64(atlas[brick, b]),
+        np.float64(atlas[brick, b + 1]),
+        np.float64(atlas[brick, b + 9]),
+        np.float64(atlas[brick, b + 10]),
+        np.float64(atlas[brick, b + 81]),
+        np.float64(atlas[brick, b + 82]),
+        np.float64(atlas[brick, b + 90]),
+        np.float64(atlas[brick, b + 91]),
     )

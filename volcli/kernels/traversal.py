@@ -143,12 +143,12 @@ def advance(i, j, k, tx, ty, tz, sx, sy, sz, ddx, ddy, ddz):
 
 
 @jit
-def enter(grid, ray):
-    """The root cell (i, j, k), counted in intervals between planes, in which the ray begins."""
+def enter(grid, o, d):
+    """The root cell (i, j, k), counted in intervals between planes, that a ray is in after o."""
     return (
-        interval(grid.planes_x, ray.o[0], ray.d[0]),
-        interval(grid.planes_y, ray.o[1], ray.d[1]),
-        interval(grid.planes_z, ray.o[2], ray.d[2]),
+        interval(grid.planes_x, o[0], d[0]),
+        interval(grid.planes_y, o[1], d[1]),
+        interval(grid.planes_z, o[2], d[2]),
     )
 
 

@@ -1,0 +1,312 @@
+"""What a ray sees of sources of radiance: spans of the ray, sampled and weighted.
+
+A span is a part of the ray over which density is one cubic and each source is one cell of its own
+lattice. Each span adds the colour of what is hit, ``T (1 - exp(-tau)) sum_i w_i c(t_i)``, with the
+weights of `cell.hit_weights`; the expected hit distance is the same sum with c = t; and what is
+emitted whatever the density, ``sum_i g_i T(t_i) e(t_i) dt``. A source may lie on another lattice
+than the density: then a density cell is cut where the ray crosses the planes of that lattice, and
+the rule keeps its order; and so where its table of colours turns sharply. (A table of many knots
+stands for a smooth curve, to which Gauss' rule does justice.)
+
+``colour``, ``emission``, ``tint`` and ``depth`` are None where the scene has no such term; numba
+compiles a version without it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from volcli.kernels.cell import (
+    MAX_TAU,
+    SHORTEST,
+    WEIGHT,
+    absorbed,
+    antiderivative,
+    hit_weights,
+)
+from volcli.kernels.compiler import jit
+from volcli.kernels.source import kink_exit, source_at, source_cell
+
+OUTER_SHARE, INNER_SHARE = WEIGHT / (2.0 + 2.0 * WEIGHT), 1.0 / (2.0 + 2.0 * WEIGHT)
+"""The shares of the nodes of Gauss' rule."""
+
+FADED = 2.0**-24
+"""What is less than this part of a number cannot change it in float32."""
+
+STOP_TAU = -math.log(FADED)
+"""The optical depth beyond which T < FADED."""
+
+
+class State(NamedTuple):
+    """What is known of a ray up to some distance.
+
+    Attributes
+    ----------
+    tau
+        Optical depth.
+    T
+        Transmittance, exp(-tau): kept up within a brick, taken afresh from tau at the next.
+    r, g, b
+        Radiance.
+    moment
+        The integral of t T sigma dt, for the expected hit distance.
+    t_far
+        Where the ray leaves the volume: no hit is farther.
+    """
+
+    tau: float
+    T: float
+    r: float
+    g: float
+    b: float
+    moment: float
+    t_far: float
+
+
+@jit
+def seen_colour(rgb, state, T, part, p, scale, u, to, at, w, colour, tint, nearest, cell, ray, tm):
+    """(r, g, b) with what particles between u and ``to`` emit, T being left at u.
+
+    Under a tint each channel has an extinction of its own, and so its own weights.
+    """
+    r, g, b = rgb
+    if tint is None:
+        hr = hg = hb = T * absorbed(part)
+        wr = wg = wb = w
+    else:
+        hr = math.exp(-tint[0] * state.tau) * absorbed(tint[0] * part)
+        hg = math.exp(-tint[1] * state.tau) * absorbed(tint[1] * part)
+        hb = math.exp(-tint[2] * state.tau) * absorbed(tint[2] * part)
+        wr = hit_weights(p, scale * tint[0], u, to)[2]
+        wg = hit_weights(p, scale * tint[1], u, to)[2]
+        wb = hit_weights(p, scale * tint[2], u, to)[2]
+    for n in range(4):
+        cr, cg, cb = source_at(colour, nearest, cell, ray, tm + at[n])
+        r += hr * wr[n] * cr
+        g += hg * wg[n] * cg
+        b += hb * wb[n] * cb
+    return r, g, b
+
+
+@jit
+def seen_emission(
+    rgb, state, T, begin, p, scale, u, to, at, emission, tint, nearest, cell, ray, tm
+):
+    """(r, g, b) with what is emitted between u and ``to`` whatever the density.
+
+    The integral of e T du by Gauss' rule, at the nodes that `hit_weights` gave: T falls by at most
+    exp(-`MAX_TAU`), and where nothing absorbs it is 1 to the bit.
+    """
+    r, g, b = rgb
+    for n in range(4):
+        er, eg, eb = source_at(emission, nearest, cell, ray, tm + at[n])
+        length = (to - u) * (OUTER_SHARE if n == 0 or n == 3 else INNER_SHARE)
+        part = max(0.0, scale * (antiderivative(p, at[n]) - begin))
+        if tint is None:
+            reached = length * T * (1.0 - absorbed(part))
+            r += reached * er
+            g += reached * eg
+            b += reached * eb
+        else:
+            r += length * math.exp(-tint[0] * (state.tau + part)) * er
+            g += length * math.exp(-tint[1] * (state.tau + part)) * eg
+            b += length * math.exp(-tint[2] * (state.tau + part)) * eb
+    return r, g, b
+
+
+@jit
+def add_span(
+    state,
+    p,
+    scale,
+    tm,
+    t0,
+    t1,
+    colour,
+    emission,
+    tint,
+    nearest,
+    depth,
+    cell,
+    ray,
+    emission_cell,
+    emission_ray,
+):
+    """Add the light of [t0, t1] to the state.
+
+    ``p`` is the density's cubic about the distance ``tm``; ``cell`` is the colour's, and ``ray`` is
+    in voxels of the colour grid; and so for emission. A span of optical depth above `MAX_TAU` is
+    added in parts, each half or twice as long as the one before, or the same, so that none is
+    above.
+    """
+    u, end = t0 - tm, t1 - tm
+    begin = antiderivative(p, u)
+    whole = max(0.0, scale * (antiderivative(p, end) - begin))
+    if emission is None and whole <= 0.0:
+        return state
+    thickest = scale * strongest(tint)
+    shortest = (end - u) * SHORTEST
+    length = end - u
+    final = state.tau + whole
+    while u < end:
+        to = min(u + length, end)
+        if thickest * (antiderivative(p, to) - begin) > MAX_TAU and length > shortest:
+            length *= 0.5
+            continue
+        tau, T, r, g, b, moment, t_far = state
+        part, at, w = hit_weights(p, scale, u, to)
+        hit = T * absorbed(part)
+        if colour is not None:
+            r, g, b = seen_colour(
+                (r, g, b),
+                state,
+                T,
+                part,
+                p,
+                scale,
+                u,
+                to,
+                at,
+                w,
+                colour,
+                tint,
+                nearest,
+                cell,
+                ray,
+                tm,
+            )
+        if emission is not None:
+            r, g, b = seen_emission(
+                (r, g, b),
+                state,
+                T,
+                begin,
+                p,
+                scale,
+                u,
+                to,
+                at,
+                emission,
+                tint,
+                nearest,
+                emission_cell,
+                emission_ray,
+                tm,
+            )
+        if depth is not None:
+            mean = at[0] * w[0] + at[1] * w[1] + at[2] * w[2] + at[3] * w[3]
+            moment += hit * (tm + mean)
+        state = State(tau + part, T - hit, r, g, b, moment, t_far)
+        if faded(state, colour, emission, tint, depth):
+            break
+        u = to
+        begin = antiderivative(p, u)
+        length *= 2.0
+    return State(final, state.T, state.r, state.g, state.b, state.moment, state.t_far)
+
+
+@jit
+def add_spans(
+    state,
+    p,
+    scale,
+    tm,
+    t0,
+    t1,
+    colour,
+    emission,
+    tint,
+    nearest,
+    depth,
+    own,
+    path,
+    emission_own,
+    emission_path,
+):
+    """As `add_span`, cut where the ray crosses the planes of a source's own lattice.
+
+    ``own`` and ``emission_own`` are as in `source_cell`.
+    """
+    t = t0
+    cell = emission_cell = (0, 0, 0, 0)
+    while t < t1:
+        if faded(state, colour, emission, tint, depth):
+            rest = antiderivative(p, t1 - tm) - antiderivative(p, t - tm)
+            return darken(state, max(0.0, scale * rest))
+        t_exit = t1
+        if colour is not None:
+            t_exit, cell = source_cell(colour, own, path, t, t_exit)
+            t_exit = kink_exit(colour.grid, colour.table, nearest, cell, path.ray, t, t_exit)
+        if emission is not None:
+            t_exit, emission_cell = source_cell(emission, emission_own, emission_path, t, t_exit)
+            t_exit = kink_exit(
+                emission.grid, emission.table, nearest, emission_cell, emission_path.ray, t, t_exit
+            )
+        state = add_span(
+            state,
+            p,
+            scale,
+            tm,
+            t,
+            t_exit,
+            colour,
+            emission,
+            tint,
+            nearest,
+            depth,
+            cell,
+            path.ray,
+            emission_cell,
+            emission_path.ray,
+        )
+        t = t_exit
+    return state
+
+
+@jit
+def strongest(tint):
+    """The largest factor of the extinction that any sum of the ray's uses."""
+    return 1.0 if tint is None else max(1.0, max(tint[0], max(tint[1], tint[2])))
+
+
+@jit
+def faded(state, colour, emission, tint, depth):
+    """Whether light that is still to come is less than 2^-24 of what the ray's brightest channel
+    has seen (and distance likewise): then only optical depth goes on.
+
+    T alone does not tell: what is behind may be brighter than what is in front.
+    """
+    weakest = 1.0 if tint is None else min(1.0, min(tint[0], min(tint[1], tint[2])))
+    if weakest * state.tau <= STOP_TAU:
+        return False
+    T = math.exp(-weakest * state.tau)
+    seen = max(abs(state.r), max(abs(state.g), abs(state.b)))
+    if colour is not None and T * colour.brightest > FADED * seen:
+        return False
+    if emission is not None and T * emission.brightest * state.t_far > FADED * seen:
+        return False
+    return depth is None or T * state.t_far <= FADED * state.moment
+
+
+@jit
+def darken(state, tau):
+    """The state after an optical depth of tau whose light is not asked for, or too weak to count.
+
+    T is left behind: it is taken afresh from tau before it is used again.
+    """
+    return State(state.tau + tau, state.T, state.r, state.g, state.b, state.moment, state.t_far)
+
+
+@jit
+def refresh(state):
+    """The state with T taken from tau, so that no product of many factors builds up."""
+    return State(
+        state.tau,
+        math.exp(-state.tau),
+        state.r,
+        state.g,
+        state.b,
+        state.moment,
+        state.t_far,
+    )
