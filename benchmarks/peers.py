@@ -28,7 +28,14 @@ from typing import Any
 import numpy as np
 
 from benchmarks import accuracy
-from benchmarks.common import make_cloud, make_dense, summary, view_of, write_results
+from benchmarks.common import (
+    CLOUD_THRESHOLD,
+    make_cloud,
+    make_dense,
+    summary,
+    view_of,
+    write_results,
+)
 from benchmarks.plots import draw
 from benchmarks.render import FOV, SIGMA_PER_VOXEL
 from volcli import schema
@@ -166,7 +173,7 @@ def truth_of(scene: dict[str, Any], rays: int) -> tuple[Any, float]:
 
 def compare(folder: Path, size: int, pixels: int, rounds: int) -> dict[str, Any]:
     """All renderers on one cloud of ``size``^3 voxels, ``pixels``^2 rays."""
-    vdb = make_cloud(folder / f"cloud_{size}.vdb", size, 0.53 if size >= 256 else 0.45)
+    vdb = make_cloud(folder / f"cloud_{size}.vdb", size, CLOUD_THRESHOLD)
     dense = folder / "dense.npy"
     origin = make_dense(vdb, dense)
     volume = open_volume(vdb)

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common import make_cloud, summary, view_of, write_results
+from benchmarks.common import CLOUD_THRESHOLD, make_cloud, summary, view_of, write_results
 from volcli import images, schema
 from volcli.camera import make_camera
 from volcli.grids import density_grid, load_density, open_volume
@@ -107,15 +107,16 @@ def vdb_render(
     *,
     step: float = 1.0,
     cutoff: float | None = None,
-    size: int = SIZE,
+    size: tuple[int, int] = (SIZE, SIZE),
+    fov: float = FOV,
     threads: int | None = None,
 ) -> VdbRender:
-    """Run vdb_render; a ``cutoff`` of None is its own default."""
+    """Run vdb_render; a ``cutoff`` of None is its own default, and its ``fov`` is horizontal."""
     with tempfile.TemporaryDirectory() as folder:
         out, log = Path(folder) / "out.exr", Path(folder) / "log.txt"
         absorb = ",".join([str(SIGMA_PER_VOXEL)] * 3)
-        command = ["vdb_render", str(path), str(out), "-v", "-res", f"{size}x{size}"]
-        command += ["-fov", str(FOV), "-translate", ",".join(map(str, eye))]
+        command = ["vdb_render", str(path), str(out), "-v", "-res", "{}x{}".format(*size)]
+        command += ["-fov", str(fov), "-translate", ",".join(map(str, eye))]
         command += ["-lookat", ",".join(map(str, center)), "-absorb", absorb, "-scatter", "0,0,0"]
         command += ["-step", str(step), "-name", "density", "-compression", "none"]
         command += ["-cpus", str(threads or available_threads())]
@@ -147,7 +148,7 @@ def main(arguments: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(a) for a in arguments]
         if not paths:
-            paths = [make_cloud(Path(folder) / "cloud_512.vdb", 512, 0.53)]
+            paths = [make_cloud(Path(folder) / "cloud_512.vdb", 512, CLOUD_THRESHOLD)]
         for path in paths:
             results[path.name] = compare(path)
             print(f"\n{path.name}: {results[path.name]['voxels']:,} voxels, {SIZE}x{SIZE} rays")
