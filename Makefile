@@ -43,6 +43,8 @@ gallery: $(SETUP)
 	mkdir -p docs/gallery
 	$(BIN)/volcli render configs/cloud.toml -o docs/gallery/cloud.png --size 960x540 --maps transmittance
 	$(BIN)/volcli render configs/explosion.toml -o docs/gallery/explosion.png --size 480x480 --set output.maps=[]
+	$(BIN)/volcli render configs/fire.toml -o docs/gallery/fire.png --size 480x480
+	$(BIN)/volcli render configs/temperature.toml -o docs/gallery/temperature.png --size 480x480
 	$(BIN)/volcli render configs/colored_smoke.toml -o docs/gallery/colored_smoke.png --size 336x480 --set output.maps=[]
 	$(BIN)/volcli render configs/rotated.toml -o docs/gallery/rotated.png --size 480x480 --set output.maps=[]
 	$(BIN)/volcli render configs/panorama.toml -o docs/gallery/panorama.png --size 800x400 --set camera.samples=9
@@ -53,6 +55,8 @@ gallery: $(SETUP)
 gallery-elsewhere: $(SETUP)
 	$(BIN)/volcli render configs/elsewhere/oiio_sphere_Cd.toml -o docs/gallery/oiio_sphere_Cd.png --size 480x480 \
 	    --set density.file=$(VOLUMES)/oiio_sphere.vdb --set color.file=$(VOLUMES)/oiio_sphere_Cd.vdb
+	$(BIN)/volcli render configs/elsewhere/density_and_heat.toml -o docs/gallery/density_and_heat.png \
+	    --size 360x480 --set density.file=$(VOLUMES)/density_and_heat.vdb
 	$(BIN)/python docs/strip_headers.py docs/gallery/*.png
 
 # The README's pictures of opacity; that of the page needs a browser (Debian: apt-get install chromium).
