@@ -3,8 +3,8 @@
     python -m benchmarks.process VOLUME.vdb ...
 
 A picture of 1920 x 1080 by the exact rule, against ``vdb_render -step 1``: the same view,
-extinction and number of threads, rounds taking turns. volcli is warm: its kernels are compiled. Its EXR holds
-transmittance, optical depth and depth too.
+extinction and number of threads, rounds taking turns. volcli is warm: its kernels are compiled. Its
+EXR holds transmittance, optical depth and depth too.
 """
 
 from __future__ import annotations

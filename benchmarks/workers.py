@@ -126,7 +126,7 @@ class VdbRender:
             scene["target"],
             step=setting["step"],
             cutoff=setting.get("cutoff"),
-            size=scene["size"],
+            size=(scene["size"], scene["size"]),
             threads=scene["threads"],
         )
         self.peak, self.whole = ran.peak_bytes, ran.whole_seconds
