@@ -17,7 +17,8 @@ from volcli.grids import density_grid, load_density, open_volume
 from volcli.grids.build import build
 from volcli.kernels.cell import cubic, integral, load
 from volcli.kernels.compiler import kernel
-from volcli.kernels.rays import move
+from volcli.kernels.integrator import make_integrator
+from volcli.kernels.rays import Density, move
 from volcli.kernels.traversal import (
     clip,
     enter,
@@ -84,6 +85,17 @@ def parts(folder: Path) -> dict[str, Callable[[], Any]]:
     eyes[:, 2] = support[0, 2] - 10
     direction = (0.1, 0.2, 0.97)
     buffer = segment_buffer()
+    density = Density(arrays, grid.local_from_world, support, 1.0, True)
+    loops = {
+        packets: make_integrator(
+            density, step_voxels=None, nearest=False, depth=True, packets=packets
+        )
+        for packets in (True, False)
+    }
+    local = np.vstack([grid.local_from_world, [0, 0, 0, 1]])
+    rays = np.linalg.solve(local, np.vstack([eyes.T, np.ones(RAYS)]))[:3].T.copy()
+    along = np.linalg.solve(local[:3, :3], direction)
+    towards = np.tile(along / np.linalg.norm(along), (RAYS, 1))
     y, x = np.indices((600, 800), np.float32)
     channels = {name: np.sin(0.01 * x + n) * np.cos(0.01 * y) for n, name in enumerate("RGBAZ")}
     return {
@@ -91,5 +103,7 @@ def parts(folder: Path) -> dict[str, Callable[[], Any]]:
         "build": lambda: build(tree, header),
         "traversal": lambda: count_segments(arrays, support, eyes, direction, buffer),
         "cell integral": lambda: integrate_cells(arrays.atlas, 1.0),
+        "rays in packets": lambda: loops[True](rays, towards),
+        "rays one by one": lambda: loops[False](rays, towards),
         "encode EXR": lambda: images.write_exr(folder / "part.exr", channels, {}),
     }

@@ -10,7 +10,11 @@ def ready(tmp_path_factory):
     return parts(tmp_path_factory.mktemp("parts"))
 
 
-@pytest.mark.parametrize("name", ["read", "build", "traversal", "cell integral", "encode EXR"])
+NAMES = ("read", "build", "traversal", "cell integral", "encode EXR")
+LOOPS = ("rays in packets", "rays one by one")
+
+
+@pytest.mark.parametrize("name", (*NAMES, *LOOPS))
 def test_part(benchmark, ready, name):
     ready[name]()  # compiles
     benchmark(ready[name])
