@@ -107,6 +107,23 @@ def startup(results: dict[str, Any]) -> str:
     return f"{_markdown(rows)}\n\n{results['volume']}; beside it, in turns: {', '.join(beside)}."
 
 
+def process(results: dict[str, Any]) -> str:
+    """Whole processes beside vdb_render's."""
+    rows = [["", "volcli", "`vdb_render -step 1`", "times faster (least to most)"]]
+    for name, row in results.items():
+        if name != "machine":
+            faster = row["times_faster"]
+            rows.append(
+                [
+                    name,
+                    f"{row['volcli']['median']:.2f} s",
+                    f"{row['vdb_render -step 1']['median']:.2f} s",
+                    f"{faster['median']:.1f} ({faster['min']:.1f} to {faster['max']:.1f})",
+                ]
+            )
+    return _markdown(rows)
+
+
 def peers(results: dict[str, Any]) -> str:
     """All renderers and settings."""
     rows = [["", "median (least to most)", "error, max", "rms", "start, load, first", "peak"]]
@@ -205,7 +222,7 @@ def _markdown(rows: list[list[str]]) -> str:
     return "\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]])
 
 
-BLOCKS = (accuracy, peers, render, load, load_large, startup, scaling, batch)
+BLOCKS = (accuracy, peers, render, process, load, load_large, startup, scaling, batch)
 """What the README has a place for; each is made of the results of its name."""
 
 
