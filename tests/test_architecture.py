@@ -14,12 +14,13 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 
 LAYERS = [
     {"errors", "fields", "srgb", "blackbody"},
+    {"memory", "leftovers"},
     {"sources", "grids", "quadrature", "files"},
     {"schema"},
     {"plan", "camera", "transforms", "kernels", "tables", "columns"},
     {"render"},
     {"config", "images", "warmup", "scene"},
-    {"opacity"},
+    {"opacity", "estimate"},
     {"run", "describe"},
     {"probe"},
     {"batch"},
@@ -98,11 +99,11 @@ def test_every_module_has_its_layer():
     assert units <= set().union(*LAYERS)
 
 
-def test_grids_know_of_nothing_but_errors():
+def test_grids_know_of_nothing_but_errors_memory_and_leftovers():
     for path in FILES:
         if unit_of(name_of(path)) == "grids":
             units = {unit_of(m) for m in imports_of(path) if m.startswith("volcli.")}
-            assert units <= {"grids", "errors"}, path
+            assert units <= {"grids", "errors", "memory", "leftovers"}, path
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
@@ -230,6 +231,7 @@ def test_an_option_that_sets_a_field_has_the_help_of_the_schema_and_no_default_o
         "settings",
         "threads",
         "cache",
+        "max_memory",
         "frames",
         "overwrite",
         "explain",

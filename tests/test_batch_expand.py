@@ -316,7 +316,7 @@ def test_a_turntable_that_frames_its_volume_shows_all_of_it_from_every_side(tmp_
 
 
 def box_of(job: Job):
-    from volcli.batch.estimate import plan_of
+    from volcli.estimate import plan_of
 
     volumes = open_volumes(job)
     plan = plan_of(job, volumes)

@@ -10,10 +10,10 @@ import pytest
 from commandline import write_ball
 
 from volcli.batch.identity import file_print, job_hash
-from volcli.batch.leftovers import remove_leftovers
 from volcli.batch.manifest import Manifest, Record, read_manifest
 from volcli.config import load_job
 from volcli.errors import OutputError
+from volcli.leftovers import remove_leftovers
 
 HASH = "0123"
 

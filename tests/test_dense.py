@@ -1,5 +1,7 @@
 """NumPy files as volumes: values, placement, and files that are not what they seem."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import reference
@@ -7,6 +9,7 @@ import reference
 from volcli.errors import VolumeError
 from volcli.grids import density_grid, load_density, open_volume
 from volcli.grids.dense import open_dense, tree_from_array
+from volcli.memory import memory_limited_to
 
 
 def values(shape, seed=0):
@@ -186,9 +189,25 @@ def test_a_header_that_lies_about_the_shape_allocates_nothing(tmp_path):
         header = {"descr": "<f4", "fortran_order": False, "shape": (100_000,) * 3}
         np.lib.format.write_array_header_1_0(out, header)
         out.write(b"\0" * 64)
-    volume = open_volume(file)
-    with pytest.raises(VolumeError, match="cannot be read"):
+    tracemalloc.start()
+    with pytest.raises(VolumeError, match="is not in the 64 bytes of the file"):
+        open_volume(file)
+    assert tracemalloc.get_traced_memory()[1] < 1e6
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("name", ["density", "voxel_size"])
+def test_a_small_archive_of_a_large_array_is_refused_before_it_is_unpacked(tmp_path, name):
+    """What zip makes of zeros: a thousandth."""
+    arrays = {"density": values((2, 2, 2)), name: np.zeros((400, 400, 100), np.float32)}
+    np.savez_compressed(tmp_path / "a.npz", **arrays)
+    assert (tmp_path / "a.npz").stat().st_size < 200_000
+    tracemalloc.start()
+    with memory_limited_to(1), pytest.raises(VolumeError, match=r"need about|one number or three"):
+        volume = open_volume(tmp_path / "a.npz")
         volume.read_tree(volume.headers[0])
+    assert tracemalloc.get_traced_memory()[1] < 4e6
+    tracemalloc.stop()
 
 
 def test_the_ending_of_a_name_may_be_in_capitals(tmp_path):

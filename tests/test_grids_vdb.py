@@ -379,8 +379,13 @@ def test_linear_transforms_carry_column_vectors(tmp_path, map_type, numbers, wor
         ({"type_name": "Something"}, "grid of type 'Something'"),
         ({"map_type": "CurvedMap"}, "transform of type 'CurvedMap'"),
         ({"map_numbers": (0.0,) * 15}, "transform without an inverse"),
-        ({"map_numbers": (np.nan,) * 15}, "transform without an inverse"),
+        ({"map_numbers": (np.nan,) * 15}, "transform with NaN or Inf"),
+        (
+            {"map_type": "AffineMap", "map_numbers": (1.0, 0.0, 0.0, 0.5) * 4},
+            "transform with a perspective",
+        ),
         ({"parent": "missing"}, "instance of 'missing'"),
+        ({"parent": "odd"}, "instance of 'odd', which has no tree"),
     ],
 )
 def test_a_grid_that_cannot_be_read_is_named_and_the_others_are_read(tmp_path, changes, refusal):

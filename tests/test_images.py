@@ -881,7 +881,7 @@ def test_a_sound_file_with_one_other_pixel_never_gets_its_name(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("step", ["_encode", "_check", "_sync", "_move"])
+@pytest.mark.parametrize("step", ["_encode", "_check", "_sync", "move_into_place"])
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
 def test_a_failure_at_any_step_leaves_the_old_file_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, error: BaseException

@@ -5,14 +5,15 @@ Images have a writer of their own, which reads back what it wrote (`volcli.image
 
 from __future__ import annotations
 
+import errno
 import io
 import os
-import secrets
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from volcli.errors import OutputError
+from volcli.leftovers import temporary_name
 
 
 def write_file(path: Path, content: bytes, *, overwrite: bool = True) -> None:
@@ -23,25 +24,66 @@ def write_file(path: Path, content: bytes, *, overwrite: bool = True) -> None:
     OutputError
         The file exists and ``overwrite`` is False, or it cannot be written.
     """
-    if path.is_symlink():
-        path = path.resolve()  # write the file that the link leads to, as open() would
-    temporary = path.with_name(f".volcli-{os.getpid()}-{secrets.token_hex(4)}")
+    path = linked(path)
+    temporary = temporary_name(path)
     try:
         with temporary.open("xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        if not overwrite and path.exists():
-            raise OutputError(f"{path}: already exists; use --overwrite or another path")
-        temporary.replace(path)
-    except OSError as error:
-        raise OutputError(
-            f"{path}: could not be written ({error.strerror or error}); check the free space and "
-            f"the permissions of '{path.parent}'"
-        ) from error
+        move_into_place(temporary, path, overwrite)
+    except FileExistsError as error:
+        raise OutputError(f"{path}: already exists; use --overwrite or another path") from error
+    except (OSError, ValueError) as error:
+        raise not_written(path, getattr(error, "strerror", None) or str(error)) from error
     finally:
-        with suppress(OSError):
+        with suppress(OSError, ValueError):
             temporary.unlink()
+
+
+def linked(path: Path) -> Path:
+    """The file that a link leads to, which is written as open() would; any other path as it is.
+
+    Raises
+    ------
+    OutputError
+        Links lead in a circle, or the path cannot be one.
+    """
+    try:
+        return path.resolve() if path.is_symlink() else path
+    except (OSError, RuntimeError, ValueError) as error:  # RuntimeError: a circle
+        raise not_written(path, getattr(error, "strerror", None) or str(error)) from error
+
+
+def move_into_place(temporary: Path, path: Path, overwrite: bool) -> None:
+    """Give a finished file its name; without ``overwrite`` even where another writer was faster.
+
+    Raises
+    ------
+    FileExistsError
+        There is one already, and it may not be overwritten.
+    OSError
+        It cannot be moved.
+    """
+    if overwrite:
+        temporary.replace(path)
+        return
+    try:
+        path.hardlink_to(temporary)
+    except FileExistsError:
+        raise
+    except OSError as error:  # a file system without hard links
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from error
+        temporary.replace(path)
+
+
+def not_written(path: Path, reason: str) -> OutputError:
+    """What to raise for a file that could not be written."""
+    return OutputError(
+        f"{path}: could not be written ({reason}); check the free space and the permissions of "
+        f"'{path.parent}'"
+    )
 
 
 FIGURES = (".png", ".svg", ".pdf")

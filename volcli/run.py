@@ -21,8 +21,10 @@ from volcli import images
 from volcli.camera import Camera, make_camera
 from volcli.config import job_as_toml
 from volcli.errors import UsageError
+from volcli.estimate import check_memory
 from volcli.grids import Cache, GridHeader, Progress
 from volcli.grids.threads import threads_limited_to
+from volcli.memory import memory_limited_to
 from volcli.plan import Plan, make_plan
 from volcli.render import RenderResult, Scene, Window, make_integrator, over, render
 from volcli.scene import Volumes, make_scene, open_volumes, read_grids, scene_box
@@ -198,6 +200,7 @@ def load(
     on_stage: OnStage = lambda stage, done, total: None,
     cache: Cache | None = None,
     threads: int | None = None,
+    memory: int | None = None,
 ) -> Loaded:
     """Read the grids that the plan names, and meanwhile begin to make the kernels ready.
 
@@ -207,11 +210,16 @@ def load(
         What keeps bricks from one load to the next.
     threads
         Default: the processors that this process may use.
+    memory
+        Bytes that this process may take in all. Default: `memory.SHARE` of what is free.
 
     Raises
     ------
     VolumeError
-        A file is damaged, or holds NaN or Inf where the job does not accept them.
+        A file is damaged, holds NaN or Inf where the job does not accept them, or does not fit
+        into memory.
+    UsageError
+        The picture does not.
     """
 
     def progress(header: GridHeader) -> Progress:
@@ -219,8 +227,10 @@ def load(
 
     job, plan, volumes = prepared.job, prepared.plan, prepared.volumes
     begin = time.perf_counter()
+    with memory_limited_to(memory):
+        check_memory(job, plan, volumes)
     kernels = WarmUp(lambda: _use_kernels(prepared)) if prepared.files else None
-    with threads_limited_to(threads):
+    with threads_limited_to(threads), memory_limited_to(memory):
         grids, warnings = read_grids(job, plan, volumes, progress, cache)
     scene, notes = make_scene(job, plan, volumes, grids)
     return Loaded(scene, (*warnings, *notes), time.perf_counter() - begin, kernels)
@@ -264,6 +274,7 @@ def render_loaded(
     if loaded.kernels is not None:
         loaded.kernels.wait(lambda done, total: on_stage("compiling", done, total))
     waited = time.perf_counter() - waiting
+    from volcli.kernels.compiler import notes
     result = render(
         loaded.scene,
         plan,
@@ -277,7 +288,7 @@ def render_loaded(
         "compile": waited + result.compile_seconds,
         "render": result.render_seconds,
     }
-    return Rendered(job, result, seconds, (*plan.warnings, *loaded.warnings))
+    return Rendered(job, result, seconds, (*plan.warnings, *loaded.warnings, *notes))
 
 
 def _use_kernels(prepared: Prepared) -> None:

@@ -7,7 +7,6 @@ orbit.py       cameras of a turntable, and one camera for a whole sequence
 expand.py      a batch file to its jobs
 identity.py    what a job is made of and what it made, as hashes: equal ones need no rendering
 manifest.py    what is done, on disk, true at any moment
-estimate.py    the memory that a job takes, and what there is
 volumes.py     grids kept in memory from one job of a worker to its next
 work.py        one job, or a tile of one, in the process of a worker
 tiles.py       a large picture in parts, and whole again

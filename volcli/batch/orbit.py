@@ -11,10 +11,10 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from volcli.batch.estimate import plan_of
 from volcli.batch.schema import Orbit
 from volcli.camera import Frame, frame_box, make_camera
 from volcli.errors import VolumeError
+from volcli.estimate import plan_of
 from volcli.grids.brick import to_world
 from volcli.scene import make_scene, open_volumes, read_grids, scene_box
 from volcli.schema import Camera, Job

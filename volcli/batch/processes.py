@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from volcli.batch.estimate import held_memory
 from volcli.batch.work import AT_ONCE, Limits, Outcome, Task, Worker
+from volcli.memory import held_memory
 
 _LOOK_SECONDS = 0.2
 """How often memory is looked at."""

@@ -13,20 +13,18 @@ from typing import Any
 
 from volcli import run
 from volcli.batch import farm
-from volcli.batch.estimate import PROCESS, available_memory, estimate
 from volcli.batch.expand import Expanded, Item
 from volcli.batch.identity import job_hash
-from volcli.batch.leftovers import remove_leftovers
 from volcli.batch.manifest import Manifest, Record
 from volcli.batch.processes import Processes
 from volcli.batch.runner import Engine, Runner, Settings, Told, Work
 from volcli.batch.tiles import windows
 from volcli.batch.work import Limits
 from volcli.errors import UsageError
+from volcli.estimate import PROCESS, estimate
+from volcli.leftovers import remove_leftovers
+from volcli.memory import SHARE, available_memory
 from volcli.render import available_threads
-
-MEMORY_SHARE = 0.75
-"""The part of the memory there is that a batch takes, if it is not told."""
 
 CORES_PER_WORKER = 4
 
@@ -45,7 +43,7 @@ class Options:
         Of each worker, to render with; None: the processors shared out, or what a cluster's worker
         was started with.
     memory
-        Bytes for all workers of this machine together; None: `MEMORY_SHARE` of what there is.
+        Bytes for all workers of this machine together; None: `memory.SHARE` of what there is.
     cache
         Folder of bricks that were built before.
     resume, force
@@ -147,7 +145,7 @@ def run_batch(
             tell(told)
 
         works = _left_to_do(expanded.items, options, manifest, tally)
-        memory = options.memory or int(MEMORY_SHARE * available_memory())
+        memory = options.memory or int(SHARE * available_memory())
         possible, hopeless = _possible(works, None if options.scheduler else memory)
         tile = options.settings.tile
         tally.tasks = len(hopeless) + sum(

@@ -19,10 +19,10 @@ from typing import Any
 
 import volcli
 from volcli import run
-from volcli.batch.estimate import PROCESS
 from volcli.batch.identity import Print, file_print
 from volcli.batch.volumes import KeptGrids
 from volcli.errors import UsageError, VolcliError
+from volcli.estimate import PROCESS
 from volcli.render import Window
 from volcli.schema import Job
 

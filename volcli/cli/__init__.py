@@ -9,26 +9,61 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from types import FrameType
+
+_received: list[int] = []
+"""Signals that are to end this process, in the order in which they came."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit; the installed script calls it without arguments."""
     is_script = arguments is None
-    if is_script:
-        _start_sooner()
     try:
+        if is_script:
+            _end_in_order()
+            _print_anywhere()
+            _start_sooner()
         from volcli.cli.app import run_app
 
         code = run_app(sys.argv[1:] if arguments is None else arguments)
     except KeyboardInterrupt:
-        print("volcli: interrupted", file=sys.stderr)
-        code = 130
+        number = _received[0] if _received else signal.SIGINT
+        how = "interrupted" if number == signal.SIGINT else "terminated"
+        print(f"volcli: {how}", file=sys.stderr)
+        code = 128 + number
     if is_script:
         _end_sooner(code)
     sys.exit(code)
+
+
+def _end_in_order() -> None:
+    """Have SIGTERM and SIGHUP end the process as Ctrl-C does: nothing half-written, workers ended.
+
+    One that is ignored stays ignored, as ``nohup`` wants it.
+    """
+
+    def end(number: int, _: FrameType | None) -> None:
+        _received.append(number)
+        raise KeyboardInterrupt
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, end)
+
+
+def _print_anywhere() -> None:
+    """Have nothing fail that is printed: where a stream is closed or cannot hold a letter."""
+    if sys.stdout is None:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123 - for as long as the process
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115, PTH123
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _start_sooner() -> None:
@@ -46,6 +81,8 @@ def _end_sooner(code: int) -> None:
 
     Nor does the process then wait for a compilation that goes on in a thread after an error.
     """
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # it ends already
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError):  # whoever read it has gone; the code says how the work ended
             stream.flush()

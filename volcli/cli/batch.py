@@ -124,12 +124,12 @@ def batch(
         )
     if collect and scheduler is None:
         raise UsageError("--collect is for --scheduler; on this machine pictures are written here")
-    from volcli.batch.estimate import parse_memory
     from volcli.batch.expand import read_batch
     from volcli.batch.runner import Settings
     from volcli.batch.session import Options, Tally, run_batch
     from volcli.cli.batch_output import Output
     from volcli.images import check_output
+    from volcli.memory import parse_memory
 
     if contact_sheet is not None:
         check_output(contact_sheet)

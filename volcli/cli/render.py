@@ -78,6 +78,15 @@ def render(
             "once. [default: none]",
         ),
     ] = None,
+    max_memory: Annotated[
+        str | None,
+        typer.Option(
+            "--max-memory",
+            metavar="SIZE",
+            help="Memory that may be taken: 8GB, or a share of what is free. What would take more "
+            "is refused before it is read. [default: 75%]",
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option(help="Whether files that exist are replaced.")] = True,
     explain: Annotated[
         bool,
@@ -130,8 +139,12 @@ def render(
         spelled=spelled,
     )
 
+    from volcli.memory import parse_memory
+
+    memory = None if max_memory is None else parse_memory(max_memory, "--max-memory")
+
     def pictures_of(one: Job) -> None:
-        _render(one, threads, cache, overwrite, explain, as_json, quiet)
+        _render(one, threads, cache, memory, overwrite, explain, as_json, quiet)
 
     if frames is None:
         pictures_of(job)
@@ -165,25 +178,33 @@ def _render(
     job: Job,
     threads: int | None,
     cache: Path | None,
+    memory: int | None,
     overwrite: bool,
     explain: bool,
     as_json: bool,
     quiet: bool,
 ) -> None:
     """The pictures of a job, and what is printed of them."""
+    from volcli.estimate import PROCESS, needed_memory
     from volcli.run import load, prepare_each, run
 
     pictures = prepare_each(job, overwrite=overwrite, writes=not explain)
     prepared = pictures[0]
+    needed = 0
+    if explain:
+        pixels = None if prepared.files else 0
+        needed = PROCESS + needed_memory(prepared.job, prepared.plan, prepared.volumes, pixels)
     with Bars(quiet) as bars:
-        loaded = load(prepared, bars, cache, threads)
+        loaded = load(prepared, bars, cache, threads, memory)
         held = _held(loaded.scene)
         if explain and not as_json:
             say(_explained(prepared.plan, held))
+            say(f"\nmemory: about {in_bytes(needed)} at its peak")
         if not prepared.files:
             _warn([*prepared.plan.warnings, *loaded.warnings])
             if as_json:
-                say(json.dumps({"plan": _plan(prepared.plan, held)}, allow_nan=False))
+                explained = {"plan": _plan(prepared.plan, held), "memory_bytes": needed}
+                say(json.dumps(explained, allow_nan=False))
             return
         if explain and not as_json:
             say()
@@ -201,6 +222,7 @@ def _render(
                 del printed["camera"]
                 if explain:
                     printed["plan"] = _plan(picture.plan, held)
+                    printed["memory_bytes"] = needed
                 say(json.dumps(printed, allow_nan=False))
             else:
                 say(_summary(report))

@@ -8,18 +8,28 @@ import sys
 import unicodedata
 from collections.abc import Sequence
 
+from volcli.errors import OutputError
+
 
 def say(text: str = "") -> None:
     """Print to stdout at once, so that it keeps its place among the lines on stderr.
 
     A reader that has gone away (``| head -1``) is not an error: the rest goes nowhere.
+
+    Raises
+    ------
+    OutputError
+        It goes to a file, and the disk is full.
     """
     try:
         print(text, flush=True)
-    except BrokenPipeError:
+    except OSError as error:
+        # What could not be written is still in the buffer, and would fail again at the end.
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
+        if not isinstance(error, BrokenPipeError):
+            raise OutputError(f"stdout: cannot be written ({error.strerror})") from error
 
 
 def terminal_width() -> int:

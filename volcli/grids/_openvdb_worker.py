@@ -13,6 +13,7 @@ import itertools
 import json
 import operator
 import os
+import resource
 import sys
 from typing import Any
 
@@ -211,6 +212,9 @@ def as_json(value: Any) -> Any:
 
 def main(task: str, path: str, out: str, *rest: str) -> int:
     openvdb.setLoggingLevel("fatal")
+    memory = int(os.environ.get("VOLCLI_MEMORY", "0"))
+    if memory:
+        resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
     try:
         if task == "tree":
             write_tree(path, out, rest[0])

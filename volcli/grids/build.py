@@ -24,9 +24,16 @@ from volcli.grids.brick import (
 )
 from volcli.grids.threads import in_threads
 from volcli.grids.tree import GridHeader, Tree
+from volcli.memory import reserve
 
 _CHUNK = 16
 """Nodes refined at a time: bounds the memory of the work to some tens of MB."""
+
+_KEY_BITS = 21
+"""Of a root cell's coordinate in its key: an int32 coordinate / 4096, and a cell beyond."""
+
+_ROW_BYTES = 200
+"""What a child takes while it is told whether another is the same, with all that is sorted."""
 
 _LEAVES = 512
 """Leaves or bricks worked on at a time, so that what is made of them stays in the cache."""
@@ -41,6 +48,12 @@ def build(tree: Tree, header: GridHeader) -> BrickGrid:
         Leaves and tiles of any value type; values become float32.
     header
         Gives the transform.
+
+    Raises
+    ------
+    MemoryLimit
+        If the bricks would take more memory than they may. (Tiles that all differ take thousands
+        of times what they take in a file.)
     """
     assert header.world_from_index is not None, "readers refuse grids without a linear transform"
     values = tree.leaf_values.astype(np.float32, copy=False)
@@ -170,21 +183,30 @@ class _SourceTables:
     def root_signatures(self) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """The root cells whose field may differ from the background, and their signatures."""
         reached = (self.roots[:, None] - CORNERS).reshape(-1, 3)
-        cells = np.unique(reached, axis=0) if len(reached) else reached
-        known = {tuple(r): e for r, e in zip(self.roots.tolist(), self.root_entries, strict=True)}
-        signatures = [
-            [known.get(tuple(n), BACKGROUND) for n in (cell + CORNERS).tolist()] for cell in cells
-        ]
-        return cells, np.array(signatures, np.int32).reshape(-1, 8)
+        cells, _ = _unique_roots(reached)
+        known = _root_keys(self.roots)
+        wanted = _root_keys((cells[:, None] + CORNERS).reshape(-1, 3))
+        at = np.minimum(np.searchsorted(known, wanted), max(len(known) - 1, 0))
+        signatures = np.full(len(wanted), BACKGROUND, np.int32)
+        if len(known):
+            found = known[at] == wanted
+            signatures[found] = self.root_entries[at[found]]
+        return cells, signatures.reshape(-1, 8)
 
 
 def _unique_roots(roots: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    """The distinct rows in order, and which of them each row is: by one key of 20 bits an axis."""
-    bits, half = 20, 1 << 19  # an int32 coordinate / 4096
-    x, y, z = (roots + half).T
-    keys, root_of = np.unique((x << 2 * bits) | (y << bits) | z, return_inverse=True)
-    axes = [keys >> 2 * bits, keys >> bits & 2 * half - 1, keys & 2 * half - 1]
-    return np.stack(axes, axis=1) - half, root_of
+    """The distinct rows in order, and which of them each row is."""
+    keys, root_of = np.unique(_root_keys(roots), return_inverse=True)
+    mask = (1 << _KEY_BITS) - 1
+    axes = [keys >> 2 * _KEY_BITS, keys >> _KEY_BITS & mask, keys & mask]
+    return np.stack(axes, axis=1) - (1 << _KEY_BITS - 1), root_of
+
+
+def _root_keys(roots: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One number for each of n root cells, in the order of their coordinates."""
+    x, y, z = (roots + (1 << _KEY_BITS - 1)).T
+    keys: NDArray[np.int64] = (x << 2 * _KEY_BITS) | (y << _KEY_BITS) | z
+    return keys
 
 
 def _flat(coordinates: NDArray[np.int64], width: int) -> NDArray[np.int64]:
@@ -224,9 +246,11 @@ def _refine(
         is all background, so that it counts as that constant.
     """
     cubes = tables.reshape(-1, width, width, width)
+    reserve(4 * len(signatures) * width**3, f"its {len(signatures):,} nodes")
     nodes = np.empty((len(signatures), width**3), np.int32)
     found = [np.empty((0, 8), np.int32)]
     places = [np.empty(0, np.int64)]
+    mixed_count = 0
     for start in range(0, len(signatures), _CHUNK):
         extended = _extended(signatures[start : start + _CHUNK], cubes, width)
         corners = [extended[:, x : x + width, y : y + width, z : z + width] for x, y, z in CORNERS]
@@ -237,6 +261,8 @@ def _refine(
         mixed = np.nonzero(~uniform)
         found.append(np.stack([corner[mixed] for corner in corners], axis=-1))
         places.append(start * width**3 + np.flatnonzero(~uniform))
+        mixed_count += len(places[-1])
+        reserve(mixed_count * _ROW_BYTES, f"its {mixed_count:,} nodes and bricks")
     rows = np.concatenate(found)
     if drop is not None and len(drop):
         rows[(rows >= 0) & drop[np.maximum(rows, 0), np.arange(8)]] = BACKGROUND
@@ -292,6 +318,8 @@ def _fill(
     costs more than what is written.
     """
     channels = values.shape[4:]
+    size = APRON**3 * 4 * (channels[0] if channels else 1)
+    reserve(len(signatures) * size, f"its {len(signatures):,} bricks")
     atlas = np.empty((len(signatures), APRON, APRON, APRON, *channels), np.float32)
 
     def fill(start: int) -> None:

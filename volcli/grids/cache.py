@@ -13,7 +13,7 @@ keeps size and time is not noticed.
 
 An entry is written under another name, then moved into place. A damaged one is built anew: its
 bytes are added up first, at memory's speed, for a wrong table would lead a kernel out of its
-arrays. Nothing here is ever deleted; the folder may be.
+arrays. Nothing here is ever deleted but what a killed writer left; the folder may be.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ import hashlib
 import json
 import mmap
 import os
-import secrets
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -33,6 +32,7 @@ from numpy.typing import NDArray
 
 from volcli.errors import VolumeError
 from volcli.grids.brick import FORMAT, BrickArrays, BrickGrid
+from volcli.leftovers import temporary_name
 
 Loaded = tuple[BrickGrid, list[str]]
 
@@ -105,7 +105,7 @@ def _write(entry: Path, grid: BrickGrid, warnings: list[str]) -> None:
     }
     header = json.dumps(described).encode()
     text = b"%08x %s" % (zlib.crc32(header), header)
-    temporary = entry.with_suffix(f".{secrets.token_hex(4)}.tmp")
+    temporary = temporary_name(entry)
     try:
         with temporary.open("xb") as file:
             file.write(text + b"\n".rjust(_ALIGNED - len(text) % _ALIGNED))

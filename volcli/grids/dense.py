@@ -3,11 +3,16 @@
 A ``.npy`` file is one grid of voxel size 1 at the origin. A ``.npz`` file holds named grids, and
 optionally ``voxel_size`` (one number or three) and ``origin`` (three numbers: the world position of
 the first lattice point), which hold for all of them. Arrays are indexed [x, y, z] or, for colour,
-[x, y, z, channel]. Outside an array a grid is 0. Pickled objects are never read.
+[x, y, z, channel]. Outside an array a grid is 0.
+
+Pickled objects are never read. What a header says of an array's size is held against what the file
+or the archive holds, and against the memory there is, before anything is allocated: a megabyte of
+zip can be a gigabyte of zeros.
 """
 
 from __future__ import annotations
 
+import math
 import struct
 import tokenize
 import zipfile
@@ -20,10 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from volcli.errors import VolumeError
+from volcli.grids.census import Census, census_of
 from volcli.grids.tree import LEAF_WIDTH, GridHeader, Progress, Tree
+from volcli.memory import no_room, reserve
 
 _PLACEMENT = ("voxel_size", "origin")
 _MAX_HEADER = 1 << 16
+_MOST_NUMBERS = 3  # of a voxel size or an origin
 
 _DAMAGE = (
     OSError,
@@ -51,7 +59,37 @@ class DenseVolume:
         """Read one array and cut it into leaves; leaves of zeros alone are left out."""
         if header.refusal:
             raise VolumeError(f"{self.path}: grid '{header.label}': {header.refusal}")
-        return tree_from_array(_load(self.path, header.name))
+        try:
+            reserve(self.census(header).tree_bytes, "its values")
+            return tree_from_array(_load(self.path, header.name))
+        except MemoryError as error:
+            raise no_room(f"{self.path}: grid '{header.label}'", error) from error
+
+    def census(self, header: GridHeader) -> Census:
+        """How much a grid holds at most: leaves of zeros alone, of which it says nothing, too.
+
+        Raises
+        ------
+        VolumeError
+            As `read_tree`.
+        """
+        if header.refusal or header.active_box is None:
+            raise VolumeError(f"{self.path}: grid '{header.label}': {header.refusal}")
+        counts = [end // LEAF_WIDTH + 1 for end in header.active_box[1]]
+        bricks = [count + 1 for count in counts]
+        dtype = np.dtype(header.value_type.removeprefix("vec3"))
+        if dtype == np.bool_ or dtype == np.float16:
+            dtype = np.dtype(np.float32)
+        return census_of(
+            leaves=math.prod(counts),
+            bricks=math.prod(bricks),
+            blocks=math.prod(count // 16 + 2 for count in counts),
+            roots=math.prod(count // 512 + 2 for count in counts),
+            tiles=0,
+            dtype=np.dtype((dtype, 3)) if header.is_vector else dtype,
+            copies=2,
+            mapped_bytes=header.file_bytes or 0 if _is_npy(self.path) else 0,
+        )
 
 
 def open_dense(path: Path) -> DenseVolume:
@@ -65,18 +103,19 @@ def open_dense(path: Path) -> DenseVolume:
     try:
         if _is_npy(path):
             with path.open("rb") as file:
-                shapes = {"density": (*_array_header(file), path.stat().st_size)}
+                shape, dtype = _array_header(file)
+                _check_size(shape, dtype, path.stat().st_size - file.tell(), "file")
+                shapes = {"density": (shape, dtype, path.stat().st_size)}
             world = np.eye(4)
         else:
             with zipfile.ZipFile(path) as archive:
                 names = [n.removesuffix(".npy") for n in archive.namelist() if n.endswith(".npy")]
-                shapes = {}
-                for name in names:
-                    if name not in _PLACEMENT:
-                        with archive.open(name + ".npy") as file:
-                            size = archive.getinfo(name + ".npy").compress_size
-                            shapes[name] = (*_array_header(file), size)
-                placed = {name: _load(path, name) for name in _PLACEMENT if name in names}
+                every = {name: _described(archive, name) for name in names}
+            shapes = {name: every[name] for name in names if name not in _PLACEMENT}
+            for name in set(every) - set(shapes):
+                if math.prod(every[name][0]) > _MOST_NUMBERS:
+                    raise _not_a_place(path, f"{name} is of shape {every[name][0]}")
+            placed = {name: _load(path, name) for name in _PLACEMENT if name in names}
             world = _placement(path, placed)
     except _DAMAGE as error:
         raise VolumeError(f"{path}: not a readable NumPy file: {_reason(error)}") from error
@@ -146,6 +185,25 @@ def _array_header(file: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
     return shape, dtype
 
 
+def _described(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any], int]:
+    """Shape and dtype of an array of an archive, and what it takes there."""
+    info = archive.getinfo(name + ".npy")
+    with archive.open(info) as file:
+        shape, dtype = _array_header(file)
+        _check_size(shape, dtype, info.file_size - file.tell(), "archive")
+    return shape, dtype, info.compress_size
+
+
+def _check_size(shape: tuple[int, ...], dtype: np.dtype[Any], size: int, where: str) -> None:
+    """Refuse an array that is said to be larger than ``size``, the bytes that there are of it."""
+    if min(shape, default=1) < 0 or (
+        math.prod(shape) * dtype.itemsize > size and not dtype.hasobject
+    ):
+        raise ValueError(
+            f"an array of shape {shape} and {dtype} is not in the {size} bytes of the {where}"
+        )
+
+
 def _load(path: Path, name: str) -> NDArray[Any]:
     try:
         loaded = np.load(path, allow_pickle=False, mmap_mode="r" if _is_npy(path) else None)
@@ -169,14 +227,16 @@ def _placement(path: Path, placed: dict[str, NDArray[Any]]) -> NDArray[np.float6
         size = np.broadcast_to(np.asarray(placed.get("voxel_size", 1.0), np.float64), 3)
         origin = np.broadcast_to(np.asarray(placed.get("origin", 0.0), np.float64), 3)
     except ValueError as error:
-        raise VolumeError(
-            f"{path}: voxel_size must be one number or three, origin three: {error}"
-        ) from error
+        raise _not_a_place(path, str(error)) from error
     if not (np.isfinite(size).all() and (size != 0).all() and np.isfinite(origin).all()):
         raise VolumeError(f"{path}: voxel_size {size} and origin {origin} make no lattice")
     world[:3, :3] = np.diag(size)
     world[:3, 3] = origin
     return world
+
+
+def _not_a_place(path: Path, reason: str) -> VolumeError:
+    return VolumeError(f"{path}: voxel_size must be one number or three, origin three: {reason}")
 
 
 def _header(
@@ -203,7 +263,7 @@ def _header(
         map_type="ScaleTranslateMap",
         world_from_index=world,
         background=0.0,
-        active_voxels=int(np.prod(shape[:3])),
+        active_voxels=math.prod(shape[:3]),
         active_box=((0, 0, 0), ends) if len(ends) == 3 else None,
         stored="dense",
         file_bytes=file_bytes,

@@ -18,6 +18,7 @@ from volcli.grids.build import build
 from volcli.grids.level_set import fog_of_level_set
 from volcli.grids.tree import GridHeader, Progress, Tree, Volume
 from volcli.grids.values import active_range, clamp_negative, settle_nonfinite
+from volcli.memory import no_room
 
 Transfer = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Densities of values, where a job has a transfer function: values below 0 are then kept."""
@@ -145,14 +146,17 @@ def _cached(
     cache: Cache | None,
 ) -> tuple[BrickGrid, list[str]]:
     """A grid by way of the cache, if there is one; ``form`` is what was made of its values."""
-    if cache is None:
-        return read()
-    settings = (type(volume).__name__, form, nonfinite)
-    if not isinstance(cache, Path):
-        return cache(volume.path, header.label, settings, read)
-    from volcli.grids.cache import through_cache
+    try:
+        if cache is None:
+            return read()
+        settings = (type(volume).__name__, form, nonfinite)
+        if not isinstance(cache, Path):
+            return cache(volume.path, header.label, settings, read)
+        from volcli.grids.cache import through_cache
 
-    return through_cache(cache, volume.path, header.label, settings, read)
+        return through_cache(cache, volume.path, header.label, settings, read)
+    except MemoryError as error:
+        raise no_room(_where(volume, header), error) from error
 
 
 def _density_notes(grid: BrickGrid, where: str, transfer: Transfer | None) -> list[str]:

@@ -29,14 +29,17 @@ from typing import Any
 import numpy as np
 
 from volcli.errors import VolumeError
+from volcli.grids.census import Census
 from volcli.grids.tree import GridHeader, Progress, Tree
 from volcli.grids.vdb import declared_box, declared_count, open_vdb, unique_labels
+from volcli.memory import memory_left
 
 INTERPRETER_VARIABLE = "VOLCLI_OPENVDB_PYTHON"
 """Environment variable: the Python interpreter that has OpenVDB's module."""
 
 _WORKER = Path(__file__).with_name("_openvdb_worker.py")
 _WORKER_FAILED = 3
+_LEAST_MEMORY = 256_000_000  # bytes that the library takes by itself
 _PROBE = """
 try:
     import openvdb as module
@@ -95,6 +98,20 @@ class OpenVDBFile:
         if progress is not None and count:
             progress(count, count)
         return Tree(**arrays)
+
+    def census(self, header: GridHeader) -> Census:
+        """How much a grid holds, as our own reader counts it.
+
+        Raises
+        ------
+        VolumeError
+            As `read_tree`.
+        """
+        own = open_vdb(self.path)
+        for known in own.headers:
+            if known.label == header.label:
+                return own.census(known)
+        raise VolumeError(f"{self.path}: no grid '{header.label}'")
 
     def _read_headers(self) -> list[dict[str, Any]]:
         """Ask for all headers; if that fails, for one at a time.
@@ -221,8 +238,10 @@ def _has_openvdb(interpreter: str) -> bool:
 
 
 def _environment() -> dict[str, str]:
-    """The environment without what would lead the other interpreter to this one's packages."""
-    return {
+    """The environment without what would lead the other interpreter to this one's packages, and
+    with the memory that it may take: the library believes what a file says of its sizes.
+    """
+    return {"VOLCLI_MEMORY": str(max(memory_left(), _LEAST_MEMORY))} | {
         key: value
         for key, value in os.environ.items()
         if not key.startswith(("PYTHON", "VIRTUAL_ENV", "__PYVENV_LAUNCHER__"))

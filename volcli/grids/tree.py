@@ -14,6 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from volcli.grids.census import Census
+
 Progress = Callable[[int, int], None]
 """Called as ``progress(done, total)`` while long work goes on."""
 
@@ -119,6 +121,16 @@ class Volume(Protocol):
     @property
     def headers(self) -> tuple[GridHeader, ...]:
         """One for each grid, in the order of the file."""
+        ...
+
+    def census(self, header: GridHeader) -> Census:
+        """How much memory a grid will take, without reading its values.
+
+        Raises
+        ------
+        VolumeError
+            As `read_tree`.
+        """
         ...
 
     def read_tree(self, header: GridHeader, progress: Progress | None = None) -> Tree:

@@ -7,8 +7,9 @@ The layout, little-endian throughout; what follows the background is `vdb_tree`'
     at begin   [compression >= 222], metadata, transform; unless an instance: 1, background, tree
 
 The format has no checksum. Lengths, counts and offsets are checked against the bytes that are left
-before anything is allocated, and what metadata say of a grid decides nothing. What turns a `Tree`
-into something to render lives in ``brick``.
+before anything is allocated, and what metadata say of a grid decides nothing. A grid is read from
+the bytes between its own offsets, and those of no two grids overlap. What turns a `Tree` into
+something to render lives in ``brick``.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from struct import Struct
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from volcli.errors import VolumeError
+from volcli.grids.census import Census
 from volcli.grids.tree import GridHeader, Progress, Tree
 from volcli.grids.vdb_codec import (
     HAS_BLOCK_MODE,
@@ -37,7 +38,9 @@ from volcli.grids.vdb_codec import (
     Damage,
     ValueType,
 )
-from volcli.grids.vdb_tree import read_tree, skip_tree
+from volcli.grids.vdb_transform import is_known, read_transform
+from volcli.grids.vdb_tree import count_tree, read_tree, skip_tree
+from volcli.memory import no_room
 
 MAGIC = 0x56444220
 VERSIONS = range(220, 226)
@@ -50,6 +53,7 @@ _HALF_SUFFIX = "_HalfFloat"
 _DUPLICATE = "\x1e"  # before the number that sets apart grids of one name
 _TYPE = re.compile(r"Tree_(\w+?)_(\d+(?:_\d+)*)")
 _CONFIGURATION = "5_4_3"
+_LONGEST = 200  # characters of a name that are shown
 
 _METADATA_LAYOUTS = {
     name: Struct("<" + code)
@@ -59,16 +63,6 @@ _METADATA_LAYOUTS = {
         *((f"mat{n}{t}", f"{n * n}{c}") for n in (3, 4) for t, c in ("sf", "dd")),
     )
 }
-_MAP_DOUBLES = {
-    "UniformScaleMap": 15,
-    "ScaleMap": 15,
-    "UniformScaleTranslateMap": 18,
-    "ScaleTranslateMap": 18,
-    "TranslationMap": 3,
-    "AffineMap": 16,
-    "UnitaryMap": 16,
-}
-_FRUSTUM = "NonlinearFrustumMap"
 
 
 @dataclass(frozen=True)
@@ -144,6 +138,24 @@ class VdbFile:
         VolumeError
             If the grid is refused (``header.refusal``) or the file is damaged.
         """
+        with self._located(header.label):
+            return read_tree(*self._tree_of(header), progress)
+
+    def census(self, header: GridHeader) -> Census:
+        """How much a grid holds, from its nodes and masks; no value of a leaf is read.
+
+        Raises
+        ------
+        VolumeError
+            As `read_tree`.
+        """
+        with self._located(header.label):
+            cursor, codec = self._tree_of(header)
+            begin = cursor.at
+            return replace(count_tree(cursor, codec), mapped_bytes=cursor.end - begin)
+
+    def _tree_of(self, header: GridHeader) -> tuple[Cursor, BlockCodec]:
+        """Where the tree of a grid begins, and what reads it."""
         grid = next((grid for grid in self._grids if grid.header.label == header.label), None)
         if grid is None:
             raise VolumeError(f"{self.path}: no grid '{header.label}'")
@@ -151,20 +163,18 @@ class VdbFile:
             raise VolumeError(
                 f"{self.path}: grid '{header.label}': not supported: {grid.header.refusal}"
             )
-        with self._located(header.label):
-            cursor = Cursor(self._data, grid.root_at)
-            return read_tree(cursor, grid.codec, progress)
+        return Cursor(grid.codec.data, grid.root_at), grid.codec
 
     @contextmanager
     def _located(self, label: str | None = None) -> Iterator[None]:
         """Turn what goes wrong inside into a VolumeError that says in which file and grid."""
-        where = f"{self.path}: " + (f"grid '{label}': " if label is not None else "")
+        where = str(self.path) + (f": grid '{label}'" if label is not None else "")
         try:
             yield
         except Damage as damage:
-            raise VolumeError(f"{where}at byte {damage.at}: {damage.what}") from damage
+            raise VolumeError(f"{where}: at byte {damage.at}: {damage.what}") from damage
         except MemoryError as error:
-            raise VolumeError(f"{where}does not fit into memory") from error
+            raise no_room(where, error) from error
 
     def _read_file_header(self, cursor: Cursor) -> None:
         if bytes(self._data[:7]) == b"NanoVDB":
@@ -191,23 +201,29 @@ class VdbFile:
         for behind in reversed(range(count)):
             descriptor = self._read_descriptor(cursor)
             with self._located(descriptor.name):
-                grid = self._read_grid_header(cursor, descriptor)
-                if self._has_offsets:
-                    cursor.at = descriptor.end
-                elif behind and not _can_skip(grid):
-                    yield _end_of_stream(grid, behind)
-                    return
-                elif behind and grid.codec is not None:
-                    skip_tree(cursor, grid.codec)
+                end = descriptor.end if self._has_offsets else cursor.end
+                grid = self._read_grid_header(Cursor(self._data[:end], cursor.at), descriptor)
+                cursor.at = descriptor.end if self._has_offsets else grid.root_at
+                if behind and not self._has_offsets:
+                    if not _can_skip(grid):
+                        yield _end_of_stream(grid, behind)
+                        return
+                    if grid.codec is not None:
+                        skip_tree(cursor, grid.codec)
             yield grid
 
     def _read_descriptor(self, cursor: Cursor) -> _Descriptor:
         name, type_name, parent = (cursor.string("the name of a grid") for _ in range(3))
-        begin, _, end = cursor.unpack(_POSITIONS, "the position of a grid")
+        begin, blocks, end = cursor.unpack(_POSITIONS, "the position of a grid")
         if self._has_offsets:
-            if not cursor.at <= begin <= end <= cursor.end:
-                what = f"grid '{name}' from byte {begin} to {end}; the file has {cursor.end}"
-                raise Damage(cursor.at - _POSITIONS.size, what)
+            # An instance has no leaves, and OpenVDB writes any number for where they are.
+            leaves_at = begin if parent else blocks
+            if not cursor.at <= begin <= leaves_at <= end <= cursor.end:
+                raise Damage(
+                    cursor.at - _POSITIONS.size,
+                    f"grid '{name[:60]}' from byte {begin} to {end}, with leaves from {blocks}; "
+                    f"there is room from {cursor.at} to {cursor.end}",
+                )
             cursor.at = begin
         return _Descriptor(name, type_name, parent, end)
 
@@ -221,15 +237,15 @@ class VdbFile:
                 raise Damage(cursor.at - 4, f"unknown compression {word:#x}")
             compression = Compression(word)
         metadata = _read_metadata(cursor)
-        map_type, world_from_index, refusal = _read_transform(cursor, self.version)
+        map_type, world_from_index, refusal = read_transform(cursor, self.version)
         half = bool(metadata.get("is_saved_as_half_float", False))
         value_type, kind, type_refusal = _value_type(descriptor.type_name)
         codec = background = None
-        if kind is not None and not descriptor.parent and _is_known(map_type):
+        if kind is not None and not descriptor.parent and is_known(map_type):
             cursor.take(4, "the number of buffers")
             background = cursor.values(kind, 1, "the background")[0]
             codec = BlockCodec(
-                self._data, self.version, compression, kind, half, np.asarray(background)
+                cursor.data, self.version, compression, kind, half, np.asarray(background)
             )
             background = codec.background
         header = GridHeader(
@@ -287,43 +303,6 @@ def _decode_metadatum(type_name: str, raw: memoryview) -> Any:
     return values if type_name.startswith("vec") else values[0]
 
 
-def _read_transform(
-    cursor: Cursor, version: int
-) -> tuple[str, NDArray[np.float64] | None, str | None]:
-    """Return the type of map, its matrix where it is linear, and a refusal where it is not."""
-    map_type = cursor.string("the type of a transform")
-    if map_type == _FRUSTUM:
-        # box, taper, depth, and the linear map behind them
-        cursor.take(6 * (8 if version > 220 else 4) + 16, "a frustum transform")
-        inner = cursor.string("the type of a transform")
-        if inner not in _MAP_DOUBLES:
-            raise Damage(cursor.at, f"a frustum transform around an unknown '{inner[:40]}'")
-        cursor.take(8 * _MAP_DOUBLES[inner], "a frustum transform")
-        return map_type, None, "frustum transform"
-    if map_type not in _MAP_DOUBLES:
-        return map_type, None, f"transform of type {map_type[:40]!r}"
-    size = _MAP_DOUBLES[map_type]
-    numbers = np.frombuffer(cursor.take(8 * size, "a transform"), "<f8")
-    matrix = np.eye(4)
-    if size == 16:
-        matrix = numbers.reshape(4, 4).T.copy()  # the file's act on row vectors
-    else:
-        if "Translat" in map_type:
-            matrix[:3, 3], numbers = numbers[:3], numbers[3:]
-        if "Scale" in map_type:
-            matrix[[0, 1, 2], [0, 1, 2]] = numbers[:3]
-    return map_type, matrix, None if _has_inverse(matrix) else "transform without an inverse"
-
-
-def _has_inverse(matrix: NDArray[np.float64]) -> bool:
-    try:
-        with np.errstate(all="ignore"):
-            inverse = np.linalg.inv(matrix)
-    except np.linalg.LinAlgError:
-        return False
-    return bool(np.isfinite(matrix).all() and np.isfinite(inverse).all())
-
-
 def _value_type(type_name: str) -> tuple[str, ValueType | None, str | None]:
     """Return the name of the type of a value, the type, and a refusal where it is not known."""
     match = _TYPE.fullmatch(type_name.removesuffix(_HALF_SUFFIX))
@@ -364,15 +343,9 @@ def _describe_storage(compression: Compression, half: bool) -> str:
     return ("half, " if half else "") + (packing or "uncompressed")
 
 
-def _is_known(map_type: str) -> bool:
-    return map_type in _MAP_DOUBLES or map_type == _FRUSTUM
-
-
 def _can_skip(grid: _Grid) -> bool:
     """Whether the end of a grid can be found without offsets."""
-    return grid.codec is not None or bool(
-        grid.descriptor.parent and _is_known(grid.header.map_type)
-    )
+    return grid.codec is not None or bool(grid.descriptor.parent and is_known(grid.header.map_type))
 
 
 def _end_of_stream(grid: _Grid, behind: int) -> _Grid:
@@ -396,8 +369,13 @@ def unique_labels(names: Sequence[str]) -> list[str]:
     return labels
 
 
+def _shown(name: str) -> str:
+    """A name fit for a terminal and for one line: nothing that a terminal would obey."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name[:_LONGEST])
+
+
 def _labelled(grids: list[_Grid]) -> list[_Grid]:
-    labels = unique_labels([grid.header.name for grid in grids])
+    labels = unique_labels([_shown(grid.header.name) for grid in grids])
     return [
         replace(grid, header=replace(grid.header, label=label))
         for grid, label in zip(grids, labels, strict=True)

@@ -17,9 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from volcli.grids.census import Census, take_census
 from volcli.grids.threads import in_threads
 from volcli.grids.tree import Progress, Tree
 from volcli.grids.vdb_codec import Block, BlockCodec, Cursor, Damage, Mode, unpack_bits
+from volcli.memory import memory_left, reserve
 
 _ROOT = Struct("<II")  # tiles, children
 _ORIGIN = Struct("<3i")
@@ -28,6 +30,8 @@ _ROOT_WIDTH, _UPPER_CHILD, _LOWER_CHILD = 4096, 128, 8  # widths in voxels
 _LEAF_VOXELS, _LEAF_MASK = 512, 64
 _LEAVES_AT_ONCE = 1024
 _UPPER_NODE_BYTES = 12 + 2 * 4096 + 1  # the least that a child of the root takes
+_LOWER_NODE_BYTES = 2 * 512 + 1  # the same of its children
+_MOST_BYTES_PER_LEAF = 8 * 729 * 4 * 3  # of bricks: eight of three channels
 
 
 @dataclass
@@ -35,10 +39,12 @@ class _Topology:
     """Leaf origins in the order of the leaves' blocks, and tiles, while a tree is walked."""
 
     leaf_origins: list[NDArray[np.int32]] = field(default_factory=list)
+    leaf_masks: list[memoryview] = field(default_factory=list)
     tile_origins: list[NDArray[np.int32]] = field(default_factory=list)
     tile_widths: list[NDArray[np.int32]] = field(default_factory=list)
     tile_values: list[NDArray[Any]] = field(default_factory=list)
     tile_active: list[NDArray[np.bool_]] = field(default_factory=list)
+    tiles: int = 0
 
     def add_tiles(
         self,
@@ -47,6 +53,9 @@ class _Topology:
         values: NDArray[Any],
         active: NDArray[np.bool_],
     ) -> None:
+        self.tiles += len(origins)
+        size = values.itemsize * (values.size // max(len(values), 1)) + 17
+        reserve(self.tiles * size, f"its {self.tiles:,} tiles")
         self.tile_origins.append(origins)
         self.tile_widths.append(np.full(len(origins), width, np.int32))
         self.tile_values.append(values)
@@ -60,27 +69,35 @@ def _read_topology(cursor: Cursor, codec: BlockCodec, values: bool = True) -> _T
     """
     topology = _Topology()
     tiles, children = cursor.unpack(_ROOT, "the root")
-    _read_root_tiles(cursor, codec, tiles, topology if values else None)
+    taken = _read_root_tiles(cursor, codec, tiles, topology if values else None)
     cursor.need(children * _UPPER_NODE_BYTES, f"{children} nodes")
-    found: dict[tuple[int, int, int], list[NDArray[np.int32]]] = {}
+    found: dict[tuple[int, int, int], list[tuple[NDArray[np.int32], memoryview]]] = {}
     for _ in range(children):
         at = cursor.at
         origin = cursor.unpack(_ORIGIN, "the origin of a node")
-        if any(x % _ROOT_WIDTH for x in origin) or origin in found:
+        if any(x % _ROOT_WIDTH for x in origin):
             raise Damage(at, f"no node can be at {origin}")
+        if origin in taken:
+            raise Damage(at, f"a second node or tile at {origin}")
+        taken.add(origin)
         kept = topology if values else None
-        leaves = found[origin] = []
-        for lower in _read_node(cursor, codec, origin, _UPPER_LOG2, _UPPER_CHILD, kept):
-            leaves.append(_read_node(cursor, codec, lower, _LOWER_LOG2, _LOWER_CHILD, kept))
-            cursor.take(_LEAF_MASK * len(leaves[-1]), "the masks of leaves")
+        nodes = found[origin] = []
+        lowers = _read_node(cursor, codec, origin, _UPPER_LOG2, _UPPER_CHILD, kept)
+        cursor.need(len(lowers) * _LOWER_NODE_BYTES, f"{len(lowers)} nodes")
+        for lower in lowers:
+            leaves = _read_node(cursor, codec, lower, _LOWER_LOG2, _LOWER_CHILD, kept)
+            nodes.append((leaves, cursor.take(_LEAF_MASK * len(leaves), "the masks of leaves")))
     # OpenVDB stores the blocks of leaves by the order of its map of nodes: x, then y, then z.
-    topology.leaf_origins = [leaves for origin in sorted(found) for leaves in found[origin]]
+    in_order = [node for origin in sorted(found) for node in found[origin]]
+    topology.leaf_origins = [leaves for leaves, _ in in_order]
+    topology.leaf_masks = [masks for _, masks in in_order]
     return topology
 
 
 def _read_root_tiles(
     cursor: Cursor, codec: BlockCodec, count: int, topology: _Topology | None
-) -> None:
+) -> set[tuple[int, int, int]]:
+    """Read the tiles of the root's table; return where there are any."""
     at = cursor.at
     size = _ORIGIN.size + codec.kind.stored_bytes + 1
     raw = np.frombuffer(cursor.take(count * size, f"{count} tiles"), np.uint8).reshape(count, size)
@@ -90,9 +107,13 @@ def _read_root_tiles(
     active = raw[:, -1] != 0
     if (origins % _ROOT_WIDTH).any():
         raise Damage(at, "a tile where none can be")
+    taken = set(map(tuple, origins.tolist()))
+    if len(taken) < count:
+        raise Damage(at, "two tiles at one place")
     if topology is not None:
         keep = active | _differs(values, codec.background)
         topology.add_tiles(origins[keep], _ROOT_WIDTH, values[keep], active[keep])
+    return taken
 
 
 def _read_node(
@@ -185,14 +206,30 @@ def skip_tree(cursor: Cursor, codec: BlockCodec) -> None:
             _locate_leaves(cursor, codec, lower)
 
 
+def count_tree(cursor: Cursor, codec: BlockCodec) -> Census:
+    """What a tree holds, from the table of its root on; no leaf is unpacked."""
+    topology = _read_topology(cursor, codec)
+    return _counted(topology, _joined(topology.leaf_origins, (0, 3), np.dtype(np.int32)), codec)
+
+
+def _counted(topology: _Topology, origins: NDArray[np.int32], codec: BlockCodec) -> Census:
+    masks = np.frombuffer(b"".join(topology.leaf_masks), np.uint8).reshape(-1, _LEAF_MASK)
+    return take_census(
+        origins, masks, topology.tiles, np.dtype((codec.kind.dtype, codec.kind.shape))
+    )
+
+
 def read_tree(cursor: Cursor, codec: BlockCodec, progress: Progress | None) -> Tree:
     """Read a tree, from the table of its root on; the leaves' blocks some at a time."""
     topology = _read_topology(cursor, codec)
     kind = codec.kind
     origins = _joined(topology.leaf_origins, (0, 3), np.dtype(np.int32))
     count = len(origins)
-    least = codec.fixed_leaf_bytes or _LEAF_MASK
+    least = codec.fixed_leaf_bytes or _LEAF_MASK + 1
     cursor.need(count * least, f"{count} leaves")
+    leaf_bytes = _LEAF_VOXELS * kind.dtype.itemsize * kind.components + _LEAF_MASK
+    if count * (leaf_bytes + _MOST_BYTES_PER_LEAF) > memory_left():  # else it fits in any case
+        reserve(_counted(topology, origins, codec).loading_bytes, f"its {count:,} leaves")
     masks = np.empty((count, _LEAF_MASK), np.uint8)
     values = np.empty((count, _LEAF_VOXELS, *kind.shape), kind.dtype)
     starts = range(0, count, _LEAVES_AT_ONCE)

@@ -4,9 +4,7 @@ compared, and only then moved into place.
 Pixels and header arrive as the file is to hold them; what they mean is for `write`.
 """
 
-import errno
 import os
-import secrets
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -16,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from volcli.errors import OutputError
+from volcli.files import linked, move_into_place, not_written
 from volcli.images.color import LINEAR
 from volcli.images.library import Failed, one_line, open_image, reason_of
+from volcli.leftovers import temporary_name
 
 Attribute = str | int | float
 """What a header may hold under a name."""
@@ -38,25 +38,20 @@ def write_whole(
     overwrite: bool,
 ) -> None:
     """Put (h, w, c) pixels into `path`: a temporary file, checked, then moved into place."""
-    if path.is_symlink():
-        path = path.resolve()  # write the file that the link leads to, as open() would
-    # Short, so that a long name of the image does not become one that is too long.
-    temporary = path.with_name(f".volcli-{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
+    path = linked(path)
+    temporary = temporary_name(path)
     try:
         # Created here and not by OpenImageIO: exclusively, and with the umask's permissions.
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         _encode(temporary, file_format, names, pixels, header, colour_space)
         _check(temporary, names, pixels, header)
         _sync(temporary)
-        _move(temporary, path, overwrite)
+        move_into_place(temporary, path, overwrite)
     except FileExistsError as error:
         raise OutputError(f"{path}: already exists; use --overwrite or another path") from error
     except (OSError, UnicodeError, Failed) as error:
         reason = reason_of(error).replace(str(temporary), path.name)
-        raise OutputError(
-            f"{path}: could not be written ({reason});"
-            f" check the free space and the permissions of '{path.parent}'"
-        ) from error
+        raise not_written(path, reason) from error
     finally:
         with suppress(OSError):
             temporary.unlink()
@@ -170,18 +165,3 @@ def _sync(file: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _move(temporary: Path, path: Path, overwrite: bool) -> None:
-    """Give the finished file its name; without `overwrite` even where another writer was faster."""
-    if overwrite:
-        temporary.replace(path)
-        return
-    try:
-        path.hardlink_to(temporary)
-    except FileExistsError:
-        raise
-    except OSError as error:  # a file system without hard links
-        if path.exists():
-            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from error
-        temporary.replace(path)

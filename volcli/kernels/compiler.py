@@ -21,9 +21,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,9 @@ _OPTIONS: dict[str, Any] = {
     "_nrt": False,
 }
 
+notes: list[str] = []
+"""What the user should know of where kernels are kept."""
+
 
 def jit(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function that kernels call.
@@ -44,14 +49,17 @@ def jit(function: Callable[..., Any]) -> Callable[..., Any]:
     Nobody else can: what it would take to be called from Python is left out, a third of the time
     that a kernel takes to compile. (Tests call them through an entry of their own.)
     """
-    bare = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    bare: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return numba.njit(forceinline=True, **bare, **_OPTIONS)(function)
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile an entry point, kept on disk for the next process."""
+    folder = _cache_folder()
+    if folder is None:
+        return numba.njit(**_OPTIONS)(function)
     before = config.CACHE_DIR  # type: ignore[attr-defined]
-    config.CACHE_DIR = str(_cache_folder())  # type: ignore[attr-defined]
+    config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
     try:
         return numba.njit(cache=True, **_OPTIONS)(function)
     finally:
@@ -73,20 +81,42 @@ def when_compiling(call: Callable[[], None]) -> Iterator[None]:
         yield
 
 
-def _cache_folder() -> Path:
+@cache
+def _cache_folder() -> Path | None:
+    """Where machine code is kept; None where there is no such place."""
     digest = hashlib.sha256(numba.__version__.encode())
     for source in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(source.read_bytes())
     name = f"kernels-{digest.hexdigest()[:16]}"
     base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
-    candidates = [Path(base)] if base else []
-    candidates += [Path("~/.cache").expanduser(), Path(tempfile.gettempdir())]
-    for candidate in candidates:
-        folder = candidate / "volcli" / name
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            continue
+    wanted = Path(base or "~/.cache")
+    with suppress(OSError, RuntimeError):  # the latter: there is no home
+        wanted = wanted.expanduser()
+        folder = wanted / "volcli" / name
+        folder.mkdir(parents=True, exist_ok=True)
         if os.access(folder, os.W_OK):
             return folder
-    return Path(tempfile.mkdtemp(prefix="volcli-"))
+    instead: Path | None = None
+    kept = "are compiled for each run"
+    with suppress(OSError):
+        folder = _own_folder() / name
+        folder.mkdir(exist_ok=True)
+        instead, kept = folder, f"are kept in {folder}"
+    notes.append(f"{wanted}: cannot be written; kernels {kept}; NUMBA_CACHE_DIR names a folder")
+    return instead
+
+
+def _own_folder() -> Path:
+    """A folder among the temporary ones that nobody else can write to: what is read from it is run.
+
+    Raises
+    ------
+    OSError
+        Somebody else has taken its name, or none can be made.
+    """
+    folder = Path(tempfile.gettempdir()) / f"volcli-kernels-{os.geteuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o022:
+        raise PermissionError(f"{folder} is not this user's own")
+    return folder
