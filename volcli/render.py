@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from volcli.camera import Camera
 from volcli.errors import NonFiniteError, UsageError
 from volcli.grids import BrickGrid, Progress
+from volcli.grids.brick import to_world
 from volcli.plan import Plan
 from volcli.tables import ColorTable, TransferTable
 
@@ -162,7 +163,7 @@ def render(
     UsageError
         If the midpoint rule's step is so short that a ray would take more than `MAX_STEPS`.
     """
-    _check_step(scene.density, plan)
+    _check_step(scene, plan)
     left, top, width, height = window or (0, 0, *camera.resolution)
 
     def layer(value: float, *channels: int) -> Floats:
@@ -329,11 +330,18 @@ def _kernel_source(
     )
 
 
-def _check_step(grid: BrickGrid, plan: Plan) -> None:
-    if plan.step_voxels is None or grid.is_empty:
+def _check_step(scene: Scene, plan: Plan) -> None:
+    grids = [scene.density, *([] if scene.emission is None else [scene.emission.grid])]
+    grids = [grid for grid in grids if not grid.is_empty]
+    if plan.step_voxels is None or not grids:
         return
-    low, high = grid.support("linear")
-    longest = float(np.linalg.norm(high - low))
+    voxel_from_world = np.linalg.inv(scene.density.world_from_index)
+    rim = np.array([[-1], [1]])
+    boxes = [
+        to_world(grid.active_box + rim, voxel_from_world @ grid.world_from_index) for grid in grids
+    ]  # in voxels of the density, as steps are
+    extent = np.max(boxes, axis=0)[1] - np.min(boxes, axis=0)[0]
+    longest = float(np.linalg.norm(extent))
     if longest / plan.step_voxels > MAX_STEPS:
         raise UsageError(
             f"--step {plan.step_voxels:g}: up to {longest / plan.step_voxels:.0e} samples a ray; "

@@ -32,28 +32,30 @@ def turning_point(p, u, end):
 def first_crossing(p, u, end, levels):
     """How far from u on, up to ``end``, the cubic stays between two levels.
 
-    The stretch may end earlier, at a turning point. Returns (to, piece): between ``levels[piece]``
-    and the next; -1 below all.
+    Returns (to, piece): between ``levels[piece]`` and the next; -1 below all.
     """
-    to = turning_point(p, u, end)  # monotone up to there: what is crossed is crossed once
-    here, there = value(p, u), value(p, to)
-    rises = there >= here
-    piece = last_below(levels, here)
-    if rises:
-        crossed = piece + 1 < len(levels) and levels[piece + 1] < there
-        level = levels[min(piece + 1, len(levels) - 1)]
-    else:
-        if piece >= 0 and levels[piece] == here:  # on its way down it is below the level already
-            piece -= 1
-        crossed = piece >= 0 and levels[piece] > there
-        level = levels[max(piece, 0)]
+    low, here = u, value(p, u)
+    while True:
+        high = turning_point(p, low, end)  # monotone up to there: what is crossed is crossed once
+        there = value(p, high)
+        rises = there >= here
+        piece = last_below(levels, here)
+        if rises:
+            crossed = piece + 1 < len(levels) and levels[piece + 1] < there
+            level = levels[min(piece + 1, len(levels) - 1)]
+        else:
+            if piece >= 0 and levels[piece] == here:  # on its way down it is below it
+                piece -= 1
+            crossed = piece >= 0 and levels[piece] > there
+            level = levels[max(piece, 0)]
+        if crossed or high >= end:
+            break
+        low, here = high, there
     if crossed:
-        low, high = u, to
         for _ in range(HALVINGS):
             middle = 0.5 * (low + high)
             if (value(p, middle) < level) == rises:
                 low = middle
             else:
                 high = middle
-        to = high
-    return to, piece
+    return high, piece
