@@ -32,8 +32,11 @@ class Term:
         What the volume file holds of that grid, by the file's own offsets; 0 where another term
         reads it already; None where the file does not say.
     evaluations
-        How often the term is evaluated in a cell (by the midpoint rule: in a step). A cell of
-        optical depth above 1 is cut, and one that another lattice crosses: then in each part.
+        How often the term is evaluated in a cell (by the midpoint rule: in a step). A cell is cut
+        in parts, each evaluated as often: where its optical depth is above 0.5
+        (`kernels.cell.MAX_TAU`), unless that is all that is asked for; where planes of a source's
+        own lattice cross it; where a value passes a stop of ``density.ramp``, or a kink of a table
+        of colours.
     """
 
     name: str
