@@ -7,13 +7,14 @@ import json
 import numpy as np
 import pytest
 import reference
-from commandline import SAMPLES, volcli, write_ball, write_grid
+from commandline import ROOT, SAMPLES, volcli, write_ball, write_grid
 from hypothesis import given
 from hypothesis import strategies as st
 from scenes import (
     TRANSFORMS,
     Medium,
     affine,
+    header,
     joined,
     medium,
     plan_for,
@@ -23,6 +24,7 @@ from scenes import (
     tree_of,
 )
 
+from volcli.grids import empty_grid
 from volcli.images import read_exr
 from volcli.probe.field import cuts, field_along, make_line
 from volcli.probe.report import COLUMNS, report, table
@@ -274,6 +276,18 @@ def test_without_a_step_there_are_no_samples_and_a_step_is_a_plan_of_its_own():
     assert len(seen_by(scene, with_step(plan, None), *ALONG).samples) == 0
 
 
+@pytest.mark.parametrize(
+    ("density", "first"), [(SLAB.grid, 6), (empty_grid(header(np.eye(4))), 18)]
+)
+def test_steps_begin_where_the_first_box_does_that_absorbs_or_emits(density, first):
+    """A slab from 5 to 15, or nothing; and light from 17 to 23."""
+    glow = medium(np.ones((5, 5, 5, 3)), (2, 2, 12), background=(1.0, 1.0, 1.0))
+    scene = Scene(density, 1e-9, (0.0,) * 3, Source(glow.grid, scale=0.3))
+    seen = seen_by(scene, plan_for(step=2.0), *ALONG)
+    np.testing.assert_allclose(seen.samples, np.arange(first, 23, 2))
+    np.testing.assert_allclose(seen.radiance, 0.3 * 6, rtol=1e-7)
+
+
 def test_a_ray_too_long_for_the_default_step_is_shown_without_and_a_step_that_is_asked_for_refused(
     tmp_path,
 ):
@@ -348,6 +362,26 @@ def test_a_probe_of_a_pixel_is_what_the_picture_holds_there(tmp_path):
             exact = ray["rules"][0]
             assert exact["rule"] == "exact"
             assert exact["error"] < 1e-14
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize(
+    ("job", "pixels"), [("fire", [(40, 40), (30, 52), (47, 25)]), ("temperature", [(38, 44)])]
+)
+def test_a_probe_sees_the_light_of_a_job_by_value_as_its_picture_does(job, pixels, tmp_path):
+    source = [ROOT / "configs" / f"{job}.toml", "--size", "80x80", "--background", "transparent"]
+    out = tmp_path / "a.exr"
+    ran = volcli("render", *source, "-o", out)
+    assert ran.code == 0, ran.err
+    channels, _ = read_exr(out)
+    asked = [text for x, y in pixels for text in ("--pixel", f"{x},{y}")]
+    for (x, y), ray in zip(pixels, probed(out, *asked), strict=True):
+        rgb = [float(channels[c][y, x]) for c in "RGB"]
+        assert max(rgb) > 0.02, "there is something to see"
+        np.testing.assert_allclose(ray["radiance"], rgb, rtol=0, atol=3e-4 * max(rgb))
+        np.testing.assert_allclose(ray["rules"][0]["radiance"], rgb, rtol=1e-6)
+        assert ray["optical_depth"] == pytest.approx(channels["optical_depth.Y"][y, x], rel=1e-6)
+        assert ray["rules"][0]["error"] < 1e-10
 
 
 @pytest.mark.needs_jit

@@ -8,7 +8,8 @@ import numpy as np
 
 from volcli.errors import UsageError
 from volcli.plan import Plan
-from volcli.probe.field import Floats, make_line
+from volcli.probe.field import Floats
+from volcli.probe.walk import span
 from volcli.render import MAX_STEPS, Scene, Source, make_integrator
 
 
@@ -64,12 +65,12 @@ def with_step(plan: Plan, step_voxels: float | None) -> Plan:
 
 def sample_count(scene: Scene, plan: Plan, origin: Floats, direction: Floats) -> float:
     """Steps of the midpoint rule along a ray; the last may be a part of one."""
-    line = make_line(scene.density, plan.nearest, origin, direction)
-    near, far = line.span
-    if scene.density.is_empty or not near < far:
+    near, far = span(scene, plan.nearest, origin, direction)
+    if not near < far:
         return 0.0
     assert plan.step_voxels is not None, "asked for by the caller"
-    return (far - near) * float(np.linalg.norm(line.d)) / plan.step_voxels
+    speed = np.linalg.norm(scene.density.local_from_world[:, :3] @ direction)
+    return (far - near) * float(speed) / plan.step_voxels
 
 
 def sample_distances(scene: Scene, plan: Plan, origin: Floats, direction: Floats) -> Floats:
@@ -85,8 +86,7 @@ def sample_distances(scene: Scene, plan: Plan, origin: Floats, direction: Floats
         return np.empty(0)
     if count > MAX_STEPS:
         raise UsageError(f"--step {plan.step_voxels:g}: {count:.0e} samples of one ray; give more")
-    line = make_line(scene.density, plan.nearest, origin, direction)
-    near, far = line.span
+    near, far = span(scene, plan.nearest, origin, direction)
     step = (far - near) / count
     begin = np.arange(np.ceil(count)) * step
     return near + (begin + np.minimum(begin + step, far - near)) / 2

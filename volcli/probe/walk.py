@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from volcli.probe.field import Field, Floats, cuts, field_along, make_line
+from volcli.probe.field import Field, Floats, Line, cuts, field_along, make_line
 from volcli.render import Scene, Source
 
 OUTER = np.polynomial.legendre.leggauss(8)
@@ -125,15 +125,11 @@ def walk(scene: Scene, nearest: bool, origin: Floats, direction: Floats) -> Walk
     origin, direction
         (3,) world units; the direction of length 1.
     """
-    grids = [scene.density]
-    if scene.emission is not None:
-        grids.append(scene.emission.grid)
-    lines = [make_line(grid, nearest, origin, direction) for grid in grids]
-    spans = [line.span if not line.grid.is_empty else (1.0, 0.0) for line in lines]
-    met = [(a, b) for a, b in spans if a < b]
-    if not met:
+    lines = _lines(scene, nearest, origin, direction)
+    spans = [line.span for line in lines if not line.grid.is_empty]
+    near, far = span(scene, nearest, origin, direction)
+    if not near < far:
         return None
-    near, far = min(a for a, _ in met), max(b for _, b in met)
     # From where the ray enters, so that a far camera costs no digits.
     sources = [scene.color] if isinstance(scene.color, Source) else []
     lines += [make_line(source.grid, nearest, origin, direction) for source in sources]
@@ -154,6 +150,21 @@ def walk(scene: Scene, nearest: bool, origin: Floats, direction: Floats) -> Walk
     return Walk(
         origin, direction, near, near + begin, near + end, density, scene, tau, light, moment
     )
+
+
+def span(scene: Scene, nearest: bool, origin: Floats, direction: Floats) -> tuple[float, float]:
+    """(near, far): the distances between which a ray is in a box that absorbs or emits, or between
+    two; near > far where it meets none."""
+    lines = _lines(scene, nearest, origin, direction)
+    spans = [line.span for line in lines if not line.grid.is_empty]
+    met = [(a, b) for a, b in spans if a < b]
+    return (min(a for a, _ in met), max(b for _, b in met)) if met else (1.0, 0.0)
+
+
+def _lines(scene: Scene, nearest: bool, origin: Floats, direction: Floats) -> list[Line]:
+    """The ray as it lies in the density, and in the emission where there is one."""
+    grids = [scene.density, *([] if scene.emission is None else [scene.emission.grid])]
+    return [make_line(grid, nearest, origin, direction) for grid in grids]
 
 
 def extinction(scene: Scene, density: Field, t: Floats) -> Floats:
