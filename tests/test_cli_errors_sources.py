@@ -135,12 +135,13 @@ WRONG = {
     "below 0 K": (
         "[color]\nblackbody = { grid = 'celsius' }",
         3,
-        "grid 'celsius': is -300 to 700, which color.blackbody makes -300 to 700 K.*offset",
+        "grid 'celsius': is -300 to 700, .* color.blackbody makes that -300 to 700 K, below 0 K; "
+        "change color.blackbody.scale or color.blackbody.offset",
     ),
     "far too hot": (
         "[color]\nblackbody = { grid = 'density', scale = 1e300 }",
         3,
-        "which color.blackbody makes .* no temperature",
+        r"color.blackbody makes that 0 to 1e\+300 K, above 1e\+09 K",
     ),
     "a word for a switch": (
         "[color]\nblackbody = { grid = 'density', normalized = 'yes' }",
@@ -190,6 +191,14 @@ def test_a_grid_of_one_value_has_no_range_for_a_map(tmp_path):
     [
         ("color.ramp.range=[3,1]", r"^volcli: --set color.ramp.range=\[3,1\]: must be \[low, high"),
         ("color.ramp.stops=[[1,0,0,0],[0,1,1,1]]", "^volcli: --set color.ramp.stops=.*must ascend"),
+        (
+            "color.ramp={map='jet', range=[3,3]}",
+            r"^volcli: --set color.ramp=\{.*\}: color.ramp.range: must be \[low, high",
+        ),
+        (
+            "color.ramp={rnage=[0,1]}",
+            r"^volcli: --set color.ramp=.*\}: unknown key 'color.ramp.rna",
+        ),
         ("color.ramp.map.x=1", "write PART.FIELD=VALUE"),
         ("color.constant.x=1", "unknown key 'color.constant.x'|must be a"),
         ("density.tint=[0,0,0]", "^volcli: --set density.tint=.*must not be 0,0,0"),

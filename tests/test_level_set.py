@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commandline import VOLUMES, volcli
+from commandline import VOLUMES, volcli, write_grid
 from scenes import tree_of
 
 from volcli.grids import load_density, open_volume
@@ -87,6 +87,13 @@ def test_the_picture_of_a_level_set_is_that_of_its_fog(tmp_path, monkeypatch):
     assert seen[0]["A"].max() > 0.5
     for channel, values in seen[0].items():
         np.testing.assert_array_equal(values, seen[1][channel], err_msg=channel)
+
+
+def test_a_grid_without_an_inside_is_told_to_be_no_level_set(tmp_path):
+    write_grid(tmp_path / "fog.vdb")
+    ran = volcli("render", tmp_path / "fog.vdb", "--explain", "--set", "density.level_set=fog")
+    assert ran.code == 0, ran.err
+    assert "is nowhere below 0, and so has no inside" in ran.err
 
 
 def test_a_real_level_set_is_fog_inside_it():

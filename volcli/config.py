@@ -275,7 +275,9 @@ def _explained(error: ValidationError, source: str, spelled: Mapping[str, str]) 
         message = problem["msg"].removeprefix("Value error, ")
         return f"{where}: {message}" if "." in key else f"{source}: {message}"
     if problem["type"] == "extra_forbidden":
-        return f"{_spelled(key, spelled) or source}: unknown key '{key}'{_suggested(key)}"
+        written = _written(key, spelled)
+        where = source if written is None else spelled[written]
+        return f"{where}: unknown key '{key}'{_suggested(key)}"
     value = problem["input"]
     if problem["type"] == "missing" and isinstance(problem["loc"][-1], str):
         return f"{where}: is missing; give {_wanted(key, problem)}"
@@ -285,12 +287,18 @@ def _explained(error: ValidationError, source: str, spelled: Mapping[str, str]) 
 
 
 def _spelled(key: str, spelled: Mapping[str, str]) -> str | None:
-    """How the user wrote a setting of a key, or of the table that it lies in."""
-    while key:
-        if key in spelled:
-            return spelled[key]
+    """How the user wrote a setting of a key; or of the table that it lies in, and the key."""
+    written = _written(key, spelled)
+    if written is None:
+        return None
+    return spelled[key] if written == key else f"{spelled[written]}: {key}"
+
+
+def _written(key: str, spelled: Mapping[str, str]) -> str | None:
+    """The key that the user wrote, of a key or of the table that it lies in."""
+    while key and key not in spelled:
         key = key.rpartition(".")[0]
-    return None
+    return key or None
 
 
 def _wanted(key: str, problem: Any) -> str:

@@ -133,6 +133,11 @@ def read_grids(
             transfer=transfer,
         )
         warnings += notes
+        if plan.level_set and density.is_empty:
+            warnings.append(
+                f"{volumes.density.path}: grid '{plan.density.label}' is nowhere below 0, and so "
+                f"has no inside; density.level_set is for distances to a surface"
+            )
     color = None if plan.color is None else source(volumes.color, plan.color)
     emission = None if plan.emission is None else source(volumes.emission, plan.emission)
     return Grids(density, color, emission), list(dict.fromkeys(warnings))

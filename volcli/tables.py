@@ -209,8 +209,9 @@ def blackbody_table(blackbody: Blackbody, field: Range, key: str, where: str) ->
     kelvin = blackbody.scale * values + blackbody.offset
     ends = blackbody.scale * np.array([low, high]) + blackbody.offset
     if not (ends.min() >= 0 and ends.max() <= HOTTEST):
+        wrong = "below 0 K" if ends.min() < 0 else f"above {HOTTEST:g} K"
         raise VolumeError(
-            f"{where}: is {low:g} to {high:g}, which {key} makes {ends.min():g} to "
-            f"{ends.max():g} K, which is no temperature; change {key}.scale or {key}.offset"
+            f"{where}: is {low:g} to {high:g}, its background included; {key} makes that "
+            f"{ends.min():g} to {ends.max():g} K, {wrong}; change {key}.scale or {key}.offset"
         )
     return ColorTable(values, blackbody_rgb(np.maximum(kelvin, 0.0), blackbody.normalized))
