@@ -26,11 +26,11 @@ def main() -> int:
         print(f"{asked.write}: {made.seed.name}, damaged")
         return 0
     numbers = range(asked.first, asked.first + asked.cases)
-    with tqdm(total=asked.cases, unit=" files", file=sys.stderr) as bar:
+    with tqdm(total=asked.cases, unit=" files", file=sys.stderr, mininterval=1.0) as bar:
 
         def progress(tally: Tally) -> None:
+            bar.set_postfix(findings=len(tally.findings), refresh=False)
             bar.update(tally.cases - bar.n)
-            bar.set_postfix(findings=len(tally.findings))
 
         tally = fuzz(numbers, kinds=asked.kinds, workers=asked.workers, progress=progress)
     for finding in tally.findings:

@@ -43,7 +43,8 @@ def commands(made: Case, file: Path, out: Path) -> list[list[str]]:
         ]
     if kind == "batch":
         return [["batch", str(file), "--dry-run"]]
-    return [["render", str(file), "-o", str(out), "--explain", "--json", "--no-overwrite", *small]]
+    # No picture: each kind of job has kernels to compile, which takes longer than a case may.
+    return [["render", str(file), "--explain", "--json", "--set", "output.image=", *small]]
 
 
 def run(made: Case, folder: Path) -> dict[str, object]:

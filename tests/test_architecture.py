@@ -20,7 +20,7 @@ LAYERS = [
     {"plan", "camera", "transforms", "kernels", "tables", "columns"},
     {"render"},
     {"config", "images", "warmup", "scene"},
-    {"opacity", "estimate"},
+    {"opacity", "estimate", "reproduce"},
     {"run", "describe"},
     {"probe"},
     {"batch"},

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -228,6 +229,24 @@ def test_a_result_that_is_not_finite_is_an_error_of_its_own(folder):
     ran = volcli("render", "ball.npz", "-o", "a.exr", *SMALL, "--density-scale", "1e300")
     assert ran.code == 5
     assert "NaN or Inf" in ran.err
+    assert ran.err.count("\n") == 1
+    assert not (folder / "a.exr").exists()
+    command = shlex.split(ran.err.partition("its ray: ")[2])
+    assert command[:2] == ["volcli", "probe"]
+    probed = volcli(*command[1:])
+    assert probed.code == 0, probed.err
+    assert f"pixel {command[4]}" in probed.out
+    assert re.search(r"optical depth (inf|\d\.?\d*e\+(2|3)\d\d)", probed.out), probed.out
+
+
+def test_light_that_is_too_bright_for_a_picture_is_told_by_its_pixel(folder):
+    ran = volcli(
+        "render", "ball.npz", "-o", "a.exr", *SMALL, "--background", "3e38,0,0",
+        "--set", "color.constant=[3e38,0,0]", "--density-scale", "1",
+        "--set", "emission.grid=density", "--set", "emission.constant=[3e38,0,0]",
+    )  # fmt: skip
+    assert ran.code == 5, ran.err
+    assert "NaN or Inf, the first at x=" in ran.err
     assert not (folder / "a.exr").exists()
 
 

@@ -37,9 +37,10 @@ class OutputError(VolcliError):
 
 
 class NonFiniteError(VolcliError):
-    """The result holds NaN or Inf."""
+    """The result holds NaN or Inf; ``pixel`` is the first (x, y) that does, where it is known."""
 
     exit_code = 5
+    pixel: "tuple[int, int] | None" = None
 
 
 class BatchError(VolcliError):

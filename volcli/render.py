@@ -200,9 +200,9 @@ def render(
             ray_light = ray_light + ray_opacity.reshape(len(ray_light), -1) * constant
         with np.errstate(over="ignore"):  # beyond float32 it is Inf, and reported as such
             tau[rows, columns] = _mean(ray_tau.reshape(*shape, *channels))
+            light[rows, columns] = _mean(ray_light.reshape(*shape, 3))
         transmittance[rows, columns] = _mean(np.exp(-ray_tau).reshape(*shape, *channels))
         opacity[rows, columns] = _mean(ray_opacity.reshape(*shape, *channels))
-        light[rows, columns] = _mean(ray_light.reshape(*shape, 3))
         if depth is not None:
             ray_depth = ray_distance * camera.depth_per_distance(directions)
             depth[rows, columns] = _mean_depth(ray_depth.reshape(shape), ray_hit.reshape(shape))
@@ -268,15 +268,30 @@ def over(result: RenderResult, background: Floats | None) -> Floats:
     ----------
     background
         (h, w, 4), or (4,), premultiplied; None: nothing is behind the volume.
+
+    Raises
+    ------
+    NonFiniteError
+        If a pixel is beyond what float32 can hold.
     """
     picture: Floats = np.dstack([result.radiance, result.alpha])
     if background is None:
         return picture
     behind = np.asarray(background, np.float32)
     if result.transmittance.ndim == 2:
-        return picture + result.transmittance[..., None] * behind
-    seen: Floats = np.dstack([result.transmittance, 1 - result.alpha])
-    return picture + seen * behind
+        seen: Floats = result.transmittance[..., None]
+    else:
+        seen = np.dstack([result.transmittance, 1 - result.alpha])
+    with np.errstate(over="ignore"):  # as above
+        picture = picture + seen * behind
+    finite = np.isfinite(picture).all(axis=-1)
+    if not finite.all():
+        y, x = (int(v) for v in np.argwhere(~finite)[0])
+        raise NonFiniteError(
+            f"{int((~finite).sum())} pixels over the background are NaN or Inf, the first at "
+            f"x={x}, y={y}; give a darker background"
+        )
+    return picture
 
 
 def make_integrator(scene: Scene, plan: Plan) -> Integrator:
@@ -356,7 +371,11 @@ def _check_finite(result: RenderResult, left: int, top: int) -> None:
         bad |= np.isnan(result.depth)
     if bad.any():
         y, x = (int(v) for v in np.argwhere(bad)[0])
-        raise NonFiniteError(
+        error = NonFiniteError(
             f"{int(bad.sum())} pixels are NaN or Inf, the first at x={left + x}, y={top + y} "
             f"(optical depth {tau[y, x].max():g}); a smaller density.scale may help"
         )
+        error.pixel = (left + x, top + y)
+        raise error
+    for part in (result.transmittance, result.opacity):
+        assert ((part >= 0) & (part <= 1)).all(), "transmittance is a probability"

@@ -27,6 +27,7 @@ from volcli.grids.threads import threads_limited_to
 from volcli.memory import memory_limited_to
 from volcli.plan import Plan, make_plan
 from volcli.render import RenderResult, Scene, Window, make_integrator, over, render
+from volcli.reproduce import naming_the_ray
 from volcli.scene import Volumes, make_scene, open_volumes, read_grids, scene_box
 from volcli.schema import DEFAULT_FOV, Job
 from volcli.tables import ColorTable, check_maps
@@ -275,14 +276,16 @@ def render_loaded(
         loaded.kernels.wait(lambda done, total: on_stage("compiling", done, total))
     waited = time.perf_counter() - waiting
     from volcli.kernels.compiler import notes
-    result = render(
-        loaded.scene,
-        plan,
-        camera,
-        threads=threads,
-        window=window,
-        progress=lambda d, n: on_stage("rendering", d, n),
-    )
+
+    with naming_the_ray(job):
+        result = render(
+            loaded.scene,
+            plan,
+            camera,
+            threads=threads,
+            window=window,
+            progress=lambda d, n: on_stage("rendering", d, n),
+        )
     seconds = {
         "load": loaded.seconds,
         "compile": waited + result.compile_seconds,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from volcli.errors import UsageError
-from volcli.images.library import Failed, one_line, open_image, reason_of
+from volcli.images.library import Failed, attributes_of, check_room, error_of, open_image, reason_of
 from volcli.images.read import check_is_file
 from volcli.images.store import Attribute
 
@@ -95,6 +95,7 @@ def read_channels(path: str | os.PathLike[str]) -> Channels:
         source.close()
     if spec.deep:
         raise UsageError(f"{path}: is a deep image; flatten it first")
+    check_room(path, spec)
     planes = [np.empty((spec.height, spec.width), np.float32) for _ in range(spec.nchannels)]
     # Only the lines of an EXR can be had in any order.
     readers = _READERS if file_format == "openexr" and not spec.tile_width else 1
@@ -109,9 +110,7 @@ def read_channels(path: str | os.PathLike[str]) -> Channels:
         planes=dict(zip(spec.channelnames, planes, strict=True)),
         sample=str(spec.format),
         associated=not spec.get_int_attribute("oiio:UnassociatedAlpha", 0),
-        attributes={
-            a.name: a.value for a in spec.extra_attribs if isinstance(a.value, str | int | float)
-        },
+        attributes=attributes_of(spec),
     )
 
 
@@ -144,9 +143,9 @@ def _take_apart(
     begin: int,
     end: int,
 ) -> None:
-    message = source.geterror()
+    message = error_of(source)
     if pixels is None or message:
-        raise UsageError(f"{path}: damaged image ({one_line(message)})")
+        raise UsageError(f"{path}: damaged image ({message or 'no reason given'})")
     rows = pixels.reshape(end - begin, -1, len(planes))
     for i, plane in enumerate(planes):
         plane[begin:end] = rows[..., i]

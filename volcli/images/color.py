@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from volcli.errors import UsageError
-from volcli.images.library import one_line, pixels_of
+from volcli.images.library import error_of, pixels_of
 from volcli.srgb import linear_from_srgb
 
 LINEAR = "lin_rec709_scene"
@@ -40,6 +40,6 @@ def linear_from_space(
     if converted.has_error:
         raise UsageError(
             f"{path}: colour space '{space}' cannot be converted"
-            f" ({one_line(converted.geterror())}); save it as sRGB or as linear Rec.709"
+            f" ({error_of(converted)}); save it as sRGB or as linear Rec.709"
         )
     return pixels_of(path, converted)

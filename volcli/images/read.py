@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from volcli.errors import UsageError
-from volcli.images.library import Failed, one_line, open_image, reason_of
+from volcli.images.library import Failed, attributes_of, check_room, error_of, open_image, reason_of
 from volcli.images.paths import mode_of
 from volcli.images.store import Attribute
 
@@ -43,10 +43,7 @@ def read_exr(
         raise UsageError(f"{path}: is {file_format}, not EXR; name an .exr that volcli wrote")
     # Copies, so that a caller that keeps one channel does not keep them all.
     channels = {name: pixels[..., i].copy() for i, name in enumerate(spec.channelnames)}
-    attributes = {
-        a.name: a.value for a in spec.extra_attribs if isinstance(a.value, str | int | float)
-    }
-    return channels, attributes
+    return channels, attributes_of(spec)
 
 
 def read_stored(path: Path) -> tuple[NDArray[np.float32], "oiio.ImageSpec", str]:
@@ -62,10 +59,11 @@ def read_stored(path: Path) -> tuple[NDArray[np.float32], "oiio.ImageSpec", str]
         spec = source.spec()
         if spec.deep:
             raise UsageError(f"{path}: is a deep image; flatten it first")
+        check_room(path, spec)
         pixels = source.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
-        message = source.geterror()
+        message = error_of(source)
         if pixels is None or message:
-            raise UsageError(f"{path}: damaged image ({one_line(message)})")
+            raise UsageError(f"{path}: damaged image ({message or 'no reason given'})")
         return pixels.reshape(spec.height, spec.width, spec.nchannels), spec, source.format_name()
     finally:
         source.close()

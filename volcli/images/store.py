@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from volcli.errors import OutputError
 from volcli.files import linked, move_into_place, not_written
 from volcli.images.color import LINEAR
-from volcli.images.library import Failed, one_line, open_image, reason_of
+from volcli.images.library import Failed, error_of, name_of, open_image, reason_of
 from volcli.leftovers import temporary_name
 
 Attribute = str | int | float
@@ -67,7 +67,9 @@ def header_of(attributes: Mapping[str, Any], *, as_text: bool = False) -> dict[s
             raise TypeError(
                 f"attribute '{name}' must be a str, int or float, not {type(value).__name__}"
             )
-        if not isinstance(value, str):
+        if isinstance(value, str):  # a path whose bytes are no text in this locale may be UTF-8
+            value = value.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+        else:
             value = int(value) if isinstance(value, int | np.integer) else float(value)
             if as_text or (isinstance(value, int) and not -(2**31) <= value < 2**31):
                 value = str(value)
@@ -105,17 +107,17 @@ def _encode(
 
     output = oiio.ImageOutput.create(file_format)
     if output is None:
-        raise Failed(one_line(oiio.geterror()))
+        raise Failed(error_of(oiio) or "no reason given")
     # A full disk shows in the message alone for PNG, in the return value alone for others.
     for step in (
-        lambda: output.open(str(file), spec),
+        lambda: output.open(name_of(file), spec),
         lambda: output.write_image(pixels),
         lambda: output.close(),
     ):
         succeeded = step()
-        message = output.geterror()
+        message = error_of(output)
         if not succeeded or message:
-            raise Failed(one_line(message))
+            raise Failed(message or "no reason given")
 
 
 def _check(
@@ -140,7 +142,7 @@ def _check(
             rows = pixels[y : y + _ROWS_PER_CHECK]
             stored = source.read_scanlines(0, 0, y, y + len(rows), 0, 0, count, kind)
             if stored is None:
-                raise Failed(f"cannot be read back: {one_line(source.geterror())}")
+                raise Failed(f"cannot be read back: {error_of(source)}")
             stored = stored.reshape(rows.shape)[..., order]
             if stored.tobytes() != rows.tobytes():  # bits, so that NaN equals NaN
                 raise Failed("read back with other pixels")

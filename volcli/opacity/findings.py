@@ -29,7 +29,7 @@ Finding = dict[str, str]
 
 def better_scale(scale: float, median_tau: float) -> float:
     """The density scale, of one digit, that brings a median optical depth to about 1."""
-    wanted = scale / median_tau
+    wanted = min(max(scale / max(median_tau, 1e-300), 1e-300), 1e300)
     power = 10.0 ** math.floor(math.log10(wanted))
     return float(f"{round(wanted / power) * power:.3g}")
 
