@@ -112,6 +112,7 @@ def test_a_kernel_is_compiled_with_the_terms_that_the_plan_names_and_without_the
             assert present == wanted, (settings, name)
 
 
+@pytest.mark.needs_jit
 def test_an_opacity_alone_and_a_constant_colour_are_one_kernel(made):
     alone = next(calls for settings, _, _, _, calls in made if not settings)
     coloured = next(c for settings, _, _, _, c in made if any("constant" in s for s in settings))
