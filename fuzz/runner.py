@@ -19,8 +19,8 @@ from fuzz.child import MEMORY
 from fuzz.mutate import ROOT
 
 SECONDS = 10.0
-FIRST_SECONDS = 240.0
-"""The first cases of a process may have kernels to compile."""
+READY_SECONDS = 240.0
+"""A process may have kernels to compile before its first case."""
 CASES_PER_PROCESS = 1000
 """So that what one leaves behind in memory is not laid at another's door for long."""
 
@@ -138,7 +138,9 @@ def _one_process(
     reader = threading.Thread(target=_forward, args=(lines, answers), daemon=True)
     reader.start()
     try:
-        for done in range(CASES_PER_PROCESS):
+        if answers.get(timeout=READY_SECONDS) != "ready\n":
+            raise RuntimeError("a sound file is not rendered: mend that first")
+        for _ in range(CASES_PER_PROCESS):
             try:
                 number = todo.get_nowait()
             except queue.Empty:
@@ -147,7 +149,7 @@ def _one_process(
             try:
                 child.stdin.write(f"{number}\n")
                 child.stdin.flush()
-                answer = answers.get(timeout=seconds if done >= 20 else FIRST_SECONDS)
+                answer = answers.get(timeout=seconds)
             except OSError:
                 answer = ""
             except queue.Empty:
