@@ -15,7 +15,8 @@ demo: $(SETUP)
 test: $(SETUP) lint
 	$(BIN)/python -m pytest -n 2
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -n 2 -q -r f \
-	    tests/test_kernels_cell.py tests/test_brick.py tests/test_render.py tests/test_render_extremes.py
+	    tests/test_kernels_cell.py tests/test_brick.py tests/test_render.py tests/test_render_extremes.py \
+	    tests/test_emission.py tests/test_tint.py tests/test_crossing.py tests/test_plan.py
 
 lint: $(SETUP)
 	$(BIN)/ruff check .
