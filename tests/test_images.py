@@ -21,6 +21,7 @@ import pytest
 from volcli import images
 from volcli.errors import NonFiniteError, OutputError, UsageError
 from volcli.images import store
+from volcli.images.color import linear_from_space
 
 JOB = '[density]\nfile = "smöke.vdb"\ngrid = "density"\n' + "# 0123456789\n" * 5000
 
@@ -596,6 +597,11 @@ def test_a_background_in_another_known_colour_space_is_converted(tmp_path: Path)
     np.testing.assert_allclose(
         background[0, 0, :3], [0.5 * 1.70505, 0.5 * -0.13026, 0.5 * -0.02400], atol=1e-4
     )
+
+
+def test_a_colour_space_whose_name_is_no_text_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="the name of its colour space is no text"):
+        linear_from_space(tmp_path / "a.exr", np.ones((2, 2, 3), np.float32), "s\udce9", False)
 
 
 def test_a_background_of_grey_is_expanded(tmp_path: Path) -> None:

@@ -30,6 +30,10 @@ def linear_from_space(
     # nothing.
     if space in ("", "Rec709", "scene_linear", "unknown"):
         space = SRGB if is_integer else LINEAR
+    if not space.isprintable():  # a damaged header: OpenImageIO takes text alone
+        raise UsageError(
+            f"{path}: the name of its colour space is no text; save it as sRGB or as linear Rec.709"
+        )
     if oiio.equivalent_colorspace(space, LINEAR):
         return rgb
     if oiio.equivalent_colorspace(space, SRGB):
