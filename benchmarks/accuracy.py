@@ -84,7 +84,7 @@ def lattice_of(tree: Any, grid: BrickGrid) -> Any:
 
 
 def _errors(seen: Any, truth: Any, colored: bool) -> dict[str, float | None]:
-    tau, light, distance, _ = seen
+    tau, light, distance, _, _ = seen
     true_tau, true_light, true_distance = truth
     transmittance = np.abs(np.exp(-tau) - np.exp(-true_tau))
     errors = {

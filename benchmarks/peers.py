@@ -159,7 +159,7 @@ def truth_of(scene: dict[str, Any], rays: int) -> tuple[Any, float]:
     )
     tau = []
     for row in range(scene["size"]):
-        tau.append(integrate(*camera.rays(slice(row, row + 1), slice(None)))[0])
+        tau.append(integrate(*camera.rays(slice(row, row + 1), slice(None))).tau)
     truth = -np.expm1(-np.array(tau))
     origins, directions = camera.rays(slice(None), slice(None))
     hit = np.flatnonzero(truth.ravel() > 1e-3)

@@ -18,6 +18,7 @@ LAYERS = [
     {"sources", "grids", "quadrature", "files"},
     {"schema"},
     {"plan", "camera", "transforms", "kernels", "tables", "columns"},
+    {"bounds"},
     {"render"},
     {"config", "images", "warmup", "scene"},
     {"opacity", "estimate", "reproduce"},

@@ -90,7 +90,7 @@ def test_one_sample_is_the_picture_of_before_bit_by_bit():
     plain, asked = shoot(m, view, 1.0, colour), shoot(m, camera_of(view, samples=1), 1.0, colour)
     integrate = make_integrator(Scene(m.grid, 1.0, colour), plan_for())
     origins, directions = view.camera.rays(slice(None), slice(None))
-    tau, _, distance, _ = integrate(origins, directions)
+    tau, _, distance, _, _ = integrate(origins, directions)
     light = -np.expm1(-tau)[:, None] * colour
     depth = distance * (directions @ view.camera.forward)
     for result in (plain, asked):

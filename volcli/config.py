@@ -62,6 +62,16 @@ _ENDS: list[tuple[str, Any, str]] = [
     ("camera.eye", _ANY, "camera.frame"),
     *(("camera.transforms", _ANY, f"camera.{name}") for name in _POSE),
     ("quadrature.rule", "exact", "quadrature.step"),
+    *(
+        ("quadrature.rule", "midpoint", f"quadrature.{name}")
+        for name in ("max_error", "target_error")
+    ),
+    *(
+        (f"quadrature.{name}", _ANY, f"quadrature.{other}")
+        for name in ("max_error", "target_error")
+        for other in ("rule", "step", "max_error", "target_error")
+        if name != other
+    ),
 ]
 """(key, value, other key): the first, set on the command line, drops the other that a file set.
 

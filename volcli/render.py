@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from volcli.bounds import SceneBounds
 from volcli.camera import Camera
 from volcli.errors import NonFiniteError, UsageError
 from volcli.grids import BrickGrid, Progress
@@ -33,6 +34,10 @@ MAX_STEPS = 10_000_000
 
 Window = tuple[int, int, int, int]
 """A rectangle of an image's pixels: left, top, width, height."""
+
+PIXEL_ERROR = 2.0**-23
+"""What rounding to float32 changes at most in a transmittance or a share of the brightest light,
+and all rounding before it, which is in float64."""
 
 TILE = 64
 """Edge of a tile in pixels: its rays share bricks, and there are enough tiles for all threads."""
@@ -75,6 +80,8 @@ class Scene:
         Factors (r, g, b) of the extinction, or None.
     transfer
         Density by the value of the grid, before ``scale``; None: the value itself.
+    bounds
+        What the grids are at most and at least, brick by brick; needed where an error is allowed.
     """
 
     density: BrickGrid
@@ -83,6 +90,7 @@ class Scene:
     emission: Source | None = None
     tint: tuple[float, float, float] | None = None
     transfer: TransferTable | None = None
+    bounds: SceneBounds | None = None
 
 
 @dataclass(frozen=True)
@@ -101,6 +109,11 @@ class RenderResult:
         ray), world units, +inf where nothing can be hit; None when the plan leaves it out. A tint
         leaves it as it is.
 
+    error_bound
+        (h, w) float32: no farther than this are transmittance and opacity (each channel of them)
+        from what they would be without ``Plan.max_error``, nor is radiance, as a share of the
+        brightest light that the scene can show; rounding included. None where nothing was allowed.
+
     Of a pixel with several samples each is the mean over them. For optical depth that is what lies
     behind the pixel on average (mass over area), no longer -log of the mean transmittance, which
     the other layer gives. Depth is weighted with each sample's opacity, the probability that it
@@ -117,6 +130,7 @@ class RenderResult:
     transmittance: Floats
     opacity: Floats
     depth: Floats | None
+    error_bound: Floats | None
     evaluations: int
     compile_seconds: float
     render_seconds: float
@@ -174,6 +188,7 @@ def render(
     tau, transmittance, opacity = (layer(value, *channels) for value in (0, 1, 0))
     light = layer(0, 3)
     depth = layer(np.inf) if plan.depth else None
+    bound = None if plan.max_error is None else layer(PIXEL_ERROR)
     constant = np.array(scene.color) if isinstance(scene.color, tuple) else None
 
     begin = time.perf_counter()
@@ -191,7 +206,7 @@ def render(
             slice(left + columns.start, left + columns.stop),
             camera.samples,
         )
-        ray_tau, ray_light, ray_distance, evaluations = integrate(origins, directions)
+        ray_tau, ray_light, ray_distance, ray_error, evaluations = integrate(origins, directions)
         ray_opacity = ray_hit = -np.expm1(-ray_tau)
         if tint is not None:
             ray_tau = ray_tau[:, None] * tint
@@ -204,8 +219,12 @@ def render(
         transmittance[rows, columns] = _mean(np.exp(-ray_tau).reshape(*shape, *channels))
         opacity[rows, columns] = _mean(ray_opacity.reshape(*shape, *channels))
         if depth is not None:
+            assert ray_distance is not None, "the plan asked for it"
             ray_depth = ray_distance * camera.depth_per_distance(directions)
             depth[rows, columns] = _mean_depth(ray_depth.reshape(shape), ray_hit.reshape(shape))
+        if bound is not None:
+            assert ray_error is not None, "as above"
+            bound[rows, columns] = _upwards(_mean(ray_error.reshape(shape)) + PIXEL_ERROR)
         return evaluations
 
     evaluations = 0
@@ -227,12 +246,19 @@ def render(
         transmittance=transmittance,
         opacity=opacity,
         depth=depth,
+        error_bound=bound,
         evaluations=evaluations,
         compile_seconds=compiled - begin,
         render_seconds=time.perf_counter() - compiled,
     )
     _check_finite(result, left, top)
     return result
+
+
+def _upwards(values: NDArray[Any]) -> Floats:
+    """To float32, to a number that is not smaller."""
+    rounded = values.astype(np.float32)
+    return np.where(rounded < values, np.nextafter(rounded, np.float32(np.inf)), rounded)
 
 
 def _sum(values: NDArray[Any]) -> NDArray[Any]:
@@ -318,6 +344,20 @@ def make_integrator(scene: Scene, plan: Plan) -> Integrator:
         step_voxels=plan.step_voxels,
         nearest=plan.nearest,
         depth=plan.depth,
+        bounds=_kernel_bounds(scene, plan),
+    )
+
+
+def _kernel_bounds(scene: Scene, plan: Plan) -> Any:
+    """The bounds as the kernels take them, with what of the error is left to them."""
+    from volcli.kernels.bounds import Bounds
+
+    if plan.max_error is None:
+        return None
+    assert scene.bounds is not None, "made where a plan allows an error"
+    made = scene.bounds
+    return Bounds(
+        made.density, made.colour, made.emission, plan.max_error - 2 * PIXEL_ERROR, made.brightest
     )
 
 

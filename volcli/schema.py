@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, Field, Strict, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, Field, Strict, field_validator, model_validator
 
 from volcli.fields import Colour, NotNegative, Number, Part, Pixels, Positive, Vector
 from volcli.sources import Color, DensityRamp, Emission
@@ -19,6 +19,9 @@ Rule = Literal["exact", "midpoint"]
 Interpolation = Literal["linear", "nearest"]
 MapName = Literal["transmittance", "opacity", "optical_depth", "depth"]
 MAPS: tuple[str, ...] = get_args(MapName)
+
+FINEST_ERROR = 1e-6
+"""The smallest error that may be asked for: a pixel's float32 is off by 6e-8 already."""
 
 DEFAULT_STEP = 0.5
 DEFAULT_FOV = 40.0
@@ -178,24 +181,56 @@ class Camera(Part):
         return self.resolution or DEFAULT_SIZES[self.type]
 
 
+def _writable(error: float) -> float:
+    if 0 < error < FINEST_ERROR:
+        raise ValueError(
+            f"must be 0, which is exact, or at least {FINEST_ERROR:g}: pixels are float32"
+        )
+    return error
+
+
+Error = Annotated[Number, Field(ge=0, lt=1), AfterValidator(_writable)]
+
+
 class Quadrature(Part):
     """How light is summed up along a ray."""
 
     rule: Rule = Field(
         "exact",
-        description="exact: optical depth right to rounding; midpoint: a sample in the middle of "
-        "each step.",
+        description="exact: optical depth right to rounding, or as right as max_error asks; "
+        "midpoint: a sample in the middle of each step.",
     )
     step: Positive | None = Field(
         None,
         description="Step of the midpoint rule, in voxels; without it the rule is exact "
         f"(a job that names midpoint and no step takes {DEFAULT_STEP}).",
     )
+    max_error: Error | None = Field(
+        None,
+        description="Error that transmittance, and radiance as a share of the brightest, may have "
+        "at most: certified, pixel by pixel. 0: exact.",
+    )
+    target_error: Error | None = Field(
+        None,
+        description="Error that pixels should stay below, judged by some rays of the picture: an "
+        "estimate. The longest step that does is taken, or the exact rule.",
+    )
 
     @model_validator(mode="after")
-    def _step_is_midpoint(self) -> Quadrature:
+    def _one_way(self) -> Quadrature:
         if self.step is not None and self.rule != "midpoint":
             raise ValueError('quadrature.step is for quadrature.rule = "midpoint"')
+        if self.max_error is not None and self.rule != "exact":
+            raise ValueError('quadrature.max_error is for quadrature.rule = "exact"')
+        if self.target_error is not None:
+            if self.rule != "exact":
+                raise ValueError(
+                    "quadrature.target_error chooses the rule; leave out quadrature.rule and step"
+                )
+            if self.max_error is not None:
+                raise ValueError(
+                    "quadrature.max_error and quadrature.target_error exclude each other; give one"
+                )
         return self
 
     @property

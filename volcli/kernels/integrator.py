@@ -8,17 +8,44 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from volcli.kernels.bounds import Bounds
 from volcli.kernels.lanes import LANES
 from volcli.kernels.rays import Density
 from volcli.kernels.source import Source
 from volcli.kernels.transfer import Transfer
 
-Integrator = Callable[[NDArray[Any], NDArray[Any]], tuple[Any, Any, Any, int]]
+
+class Traced(NamedTuple):
+    """What rays see.
+
+    Attributes
+    ----------
+    tau
+        (n,) float64: optical depth.
+    radiance
+        (n, 3) float64: the light of sources that vary from point to point; 0 without one.
+    distance
+        (n,) float64: the expected hit distance, +inf where nothing can be hit; None if not wanted.
+    error
+        (n,) float64: what transmittance, and radiance as a share of the brightest, is off by at
+        most; None where nobody asked for less than all.
+    evaluated
+        Cells, or samples, or parts taken as a whole.
+    """
+
+    tau: NDArray[np.float64]
+    radiance: NDArray[np.float64]
+    distance: NDArray[np.float64] | None
+    error: NDArray[np.float64] | None
+    evaluated: int
+
+
+Integrator = Callable[[NDArray[Any], NDArray[Any]], Traced]
 
 
 def make_integrator(
@@ -31,47 +58,55 @@ def make_integrator(
     step_voxels: float | None,
     nearest: bool,
     depth: bool,
+    bounds: Bounds | None = None,
     packets: bool = LANES > 1,
 ) -> Integrator:
     """A function of origins and directions, (n, 3) float64 each, that any thread may call.
 
-    It returns (tau, radiance, distance, evaluated): (n,), (n, 3), (n,) float64 and a number. The
-    radiance is 0 without ``colour`` and ``emission``, the distance None without ``depth``. What the
-    parameters mean is said in `rays.integrate_rays`.
+    What the parameters mean is said in `rays.integrate_rays`.
 
     Parameters
     ----------
+    bounds
+        What the rule may use instead of cells, and the error that it may make; None: exact.
     packets
         Whether packets may be used.
     """
     how = (step_voxels, True if nearest else None)  # a term that is out is None, not False
+    if not (colour or emission or bounds):
+        tint = None  # then it is for the caller, as the constant colour is
 
     if packets and transfer is None and colour is None and emission is None:
         from volcli.kernels.packets import integrate_packets, packet_buffer
 
-        def run(rays: Any, distance: Any, tau: Any, light: Any, buffer: Any) -> int:
-            return integrate_packets(*rays, density, *how, distance, tau, buffer)
+        def run(rays: Any, distance: Any, error: Any, tau: Any, light: Any, buffer: Any) -> int:
+            return integrate_packets(
+                *rays, density, *how, bounds, tint, distance, error, tau, buffer
+            )
 
         make_buffer: Callable[[], Any] = packet_buffer
     else:
         from volcli.kernels.rays import integrate_rays
         from volcli.kernels.traversal import segment_buffer
 
-        terms = (transfer, colour, emission, tint if colour or emission else None)
+        terms = (transfer, colour, emission, tint)
 
-        def run(rays: Any, distance: Any, tau: Any, light: Any, buffer: Any) -> int:
-            return integrate_rays(*rays, density, *terms, *how, distance, tau, light, buffer)
+        def run(rays: Any, distance: Any, error: Any, tau: Any, light: Any, buffer: Any) -> int:
+            return integrate_rays(
+                *rays, density, *terms, *how, bounds, distance, error, tau, light, buffer
+            )
 
         make_buffer = segment_buffer
 
     kept = threading.local()  # each thread keeps its buffer: memory that is new is slow
 
-    def integrate(origins: NDArray[Any], directions: NDArray[Any]) -> tuple[Any, Any, Any, int]:
+    def integrate(origins: NDArray[Any], directions: NDArray[Any]) -> Traced:
         if not hasattr(kept, "buffer"):
             kept.buffer = make_buffer()
         n = len(origins)
         tau, light, distance = np.zeros(n), np.zeros((n, 3)), np.empty(n) if depth else None
-        evaluated = run((origins, directions), distance, tau, light, kept.buffer)
-        return tau, light, distance, int(evaluated)
+        error = None if bounds is None else np.zeros(n)
+        evaluated = run((origins, directions), distance, error, tau, light, kept.buffer)
+        return Traced(tau, light, distance, error, int(evaluated))
 
     return integrate

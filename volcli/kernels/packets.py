@@ -171,7 +171,17 @@ def packet(rays, t_far, alive, density, step, nearest, depth, skip_background, b
 
 @kernel
 def integrate_packets(
-    origins, directions, density, step_voxels, nearest, depth, optical_depth, buffer
+    origins,
+    directions,
+    density,
+    step_voxels,
+    nearest,
+    bounds,
+    tint,
+    depth,
+    error,
+    optical_depth,
+    buffer,
 ):
     """Integrate a batch of rays; parameters and result are those of `rays.integrate_rays`, whose
     terms that are missing here are out.

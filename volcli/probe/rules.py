@@ -49,7 +49,7 @@ def seen_by(scene: Scene, plan: Plan, origin: Floats, direction: Floats) -> Seen
     samples = np.empty(0)
     if plan.step_voxels is not None:
         samples = sample_distances(scene, plan, origin, direction)
-    tau, light, _, evaluations = make_integrator(scene, plan)(origin[None], direction[None])
+    tau, light, _, _, evaluations = make_integrator(scene, plan)(origin[None], direction[None])
     radiance = np.array(light[0], np.float64)
     if not isinstance(scene.color, Source):
         tint = 1.0 if scene.tint is None else np.array(scene.tint)
@@ -60,7 +60,7 @@ def seen_by(scene: Scene, plan: Plan, origin: Floats, direction: Floats) -> Seen
 
 def with_step(plan: Plan, step_voxels: float | None) -> Plan:
     """The plan with another rule: midpoint with a step, or exact."""
-    return replace(plan, step_voxels=step_voxels)
+    return replace(plan, step_voxels=step_voxels, max_error=None)
 
 
 def sample_count(scene: Scene, plan: Plan, origin: Floats, direction: Floats) -> float:
