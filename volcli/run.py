@@ -233,7 +233,7 @@ def load(
     kernels = WarmUp(lambda: _use_kernels(prepared)) if prepared.files else None
     with threads_limited_to(threads), memory_limited_to(memory):
         grids, warnings = read_grids(job, plan, volumes, progress, cache)
-    scene, notes = make_scene(job, plan, volumes, grids)
+    scene, notes = make_scene(job, plan, volumes, grids, threads=threads)
     return Loaded(scene, (*warnings, *notes), time.perf_counter() - begin, kernels)
 
 

@@ -6,12 +6,13 @@ What is read is what the plan names, a grid that several terms use once. Nothing
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from volcli.bounds import scene_bounds
 from volcli.grids import (
     BrickGrid,
     Cache,
@@ -149,6 +150,7 @@ def make_scene(
     volumes: Volumes,
     grids: Grids,
     table: Callable[..., ColorTable] = source_table,
+    threads: int | None = None,
 ) -> tuple[Scene, list[str]]:
     """The scene of a job, and warnings on what it shows.
 
@@ -156,6 +158,9 @@ def make_scene(
     ----------
     table
         Makes the colours of a scalar grid's values; see `tables.source_table`.
+    threads
+        That make the bounds of grids, where the plan allows an error. Default: the processors that
+        this process may use.
 
     Raises
     ------
@@ -179,6 +184,8 @@ def make_scene(
         tint=job.density.tint if plan.tint else None,
         transfer=None if job.density.ramp is None else transfer_table(job.density.ramp),
     )
+    if plan.max_error is not None:
+        scene = replace(scene, bounds=scene_bounds(scene, plan.nearest, threads))
     return scene, notes
 
 
