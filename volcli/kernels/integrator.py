@@ -81,10 +81,12 @@ def make_integrator(
 
         def run(rays: Any, distance: Any, error: Any, tau: Any, light: Any, buffer: Any) -> int:
             return integrate_packets(
-                *rays, density, *how, bounds, tint, distance, error, tau, buffer
+                *rays, density, *how, bounds, tint, distance, error, tau, *buffer
             )
 
-        make_buffer: Callable[[], Any] = packet_buffer
+        def make_buffer() -> Any:
+            return packet_buffer(bounds)
+
     else:
         from volcli.kernels.rays import integrate_rays
         from volcli.kernels.traversal import segment_buffer

@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from volcli.kernels.cell import (
     MAX_TAU,
     SHORTEST,
@@ -21,16 +23,36 @@ from volcli.kernels.cell import (
     trilinear,
 )
 from volcli.kernels.compiler import jit
-from volcli.kernels.lane_memory import gather, gather_square, load, scatter
+from volcli.kernels.lane_memory import gather, gather_square, load, scatter, store
 from volcli.kernels.lanes import LANES, any_of, floats, ints, numbers, pick, to_floats, to_ints
 from volcli.kernels.light import FADED
-from volcli.kernels.packet_walk import enter_cube, make_rays, nearest_plane, unpack
+from volcli.kernels.packet_walk import Buffer, enter_cube, make_rays, nearest_plane, unpack
 from volcli.kernels.traversal import BRICK
 
-CORNER_ROW, STEP_ROW, FAR_ROW, SPEED_ROW, TAU_ROW, MOMENT_ROW, RAY_ROWS = 9, 12, 13, 14, 15, 16, 17
+CORNER_ROW, STEP_ROW, FAR_ROW, SPEED_ROW, TAU_ROW, MOMENT_ROW, SLACK_ROW = 9, 12, 13, 14, 15, 16, 17
+RAY_ROWS = 18
 """Numbers kept of each ray, a row of `LANES` for each: o, d and inverse come first (3 rows each),
 then the root cell's corner, the step of the midpoint rule, t_far, the planes crossed per world unit
-of distance, and the sums."""
+of distance, and the sums; the slack is what tau may be off by."""
+
+
+BINS = 32
+"""Lengths that the sort tells apart: a segment has at most 3 * (8 - 1) + 1 = 22 cells."""
+
+
+def make_buffer(room):
+    """An empty `Buffer` for so many segments."""
+    return Buffer(
+        begin=np.empty(room),
+        end=np.empty(room),
+        content=np.empty(room, np.int64),
+        tau=np.empty(room),
+        moment=np.empty(room),
+        key=np.empty(room, np.int8),
+        order=np.empty(room, np.int32),
+        rays=np.empty(RAY_ROWS * LANES),
+        bins=np.empty(BINS + 1, np.int64),
+    )
 
 
 class Segments(NamedTuple):
@@ -96,10 +118,60 @@ def kept_vector(buffer, row, ray, mask):
 
 
 @jit
+def sort_by_length(buffer, total, listed=None):
+    """Sort the segments by the number of cells that they cross, about: all, or those listed."""
+    for first in range(0, total, LANES):
+        here = numbers() + first < total
+        if listed is None:
+            content = load(buffer.content, first)
+            length = load(buffer.end, first) - load(buffer.begin, first)
+        else:
+            place = load(listed, first)
+            content = gather(buffer.content, place, here)
+            length = gather(buffer.end, place, here) - gather(buffer.begin, place, here)
+        cells = length * kept(buffer, SPEED_ROW, content & (LANES - 1), here)
+        store(buffer.key, first, to_ints(min(max(cells, 0.0), BINS - 1.0)))
+    bins = buffer.bins
+    for b in range(BINS + 1):
+        bins[b] = 0
+    for n in range(total):
+        bins[buffer.key[n] + 1] += 1
+    for b in range(BINS):
+        bins[b + 1] += bins[b]
+    for n in range(total):
+        key = buffer.key[n]
+        buffer.order[bins[key]] = n if listed is None else listed[n]
+        bins[key] += 1
+
+
+@jit
+def compose(buffer, total, depth):
+    """Put the segments behind what is known of their rays, front to back."""
+    sums = buffer.rays
+    for n in range(total):
+        at = TAU_ROW * LANES + (buffer.content[n] & (LANES - 1))
+        tau = sums[at]
+        sums[at] = tau + buffer.tau[n]
+        if depth is not None:
+            buffer.tau[n] = tau  # what lies before the segment
+    if depth is not None:
+        for first in range(0, total, LANES):
+            before = math.exp(-load(buffer.tau, first))
+            store(buffer.moment, first, before * load(buffer.moment, first))
+        for n in range(total):
+            sums[MOMENT_ROW * LANES + (buffer.content[n] & (LANES - 1))] += buffer.moment[n]
+
+
+@jit
 def fetch(buffer, first, total):
     """`Segments` first to first + LANES, in sorted order."""
     here = numbers() + first < total
-    place = pick(here, load(buffer.order, first), 0)
+    return fetch_at(buffer, pick(here, load(buffer.order, first), 0), here)
+
+
+@jit
+def fetch_at(buffer, place, here):
+    """`Segments` at places in the buffer, where ``here`` holds."""
     brick, (x, y, z), ray = unpack(gather(buffer.content, place, here))
     rays = make_rays(
         kept_vector(buffer, 0, ray, here),

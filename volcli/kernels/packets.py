@@ -6,34 +6,34 @@ are integrated side by side, a segment a lane, sorted by length so that the lane
 and each ray is put together from its segments, front to back. What happens in a cell is `cell`'s,
 for a register as for a scalar.
 
-A ray's result depends on nothing but the ray: neither on its packet nor on the order of segments.
+A ray's result depends on nothing but the ray: neither on its packet nor on the order of buffer.
 """
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from volcli.kernels.cell import absorbed
 from volcli.kernels.compiler import jit, kernel
 from volcli.kernels.lane_memory import gather, load, scatter, store
-from volcli.kernels.lanes import LANES, any_of, floats, ints, numbers, pick, to_ints
+from volcli.kernels.lanes import LANES, any_of, floats, ints, numbers, pick
+from volcli.kernels.packet_bounded import bounded_buffer, bounded_segments, error_of
 from volcli.kernels.packet_rules import (
     CORNER_ROW,
     FAR_ROW,
     MOMENT_ROW,
-    RAY_ROWS,
+    SLACK_ROW,
     SPEED_ROW,
     STEP_ROW,
     TAU_ROW,
+    compose,
     exact_segments,
-    kept,
+    make_buffer,
     midpoint_segments,
+    sort_by_length,
 )
 from volcli.kernels.packet_walk import (
     ROOM,
-    Buffer,
     absolute,
     clip_axis,
     enter,
@@ -44,23 +44,12 @@ from volcli.kernels.packet_walk import (
     root_segments,
 )
 
-BINS = 32
-"""Lengths that the sort tells apart: a segment has at most 3 * (8 - 1) + 1 = 22 cells."""
 
-
-def packet_buffer() -> Buffer:
-    """An empty `Buffer`."""
-    return Buffer(
-        begin=np.empty(ROOM),
-        end=np.empty(ROOM),
-        content=np.empty(ROOM, np.int64),
-        tau=np.empty(ROOM),
-        moment=np.empty(ROOM),
-        key=np.empty(ROOM, np.int8),
-        order=np.empty(ROOM, np.int32),
-        rays=np.empty(RAY_ROWS * LANES),
-        bins=np.empty(BINS + 1, np.int64),
-    )
+def packet_buffer(bounds):
+    """Room for the work of one thread: (`packet_walk.Buffer`, `packet_bounded.BoundedBuffer` or
+    None), the latter with bounds alone."""
+    buffer = make_buffer(ROOM)
+    return buffer, None if bounds is None else bounded_buffer(buffer)
 
 
 @jit
@@ -78,45 +67,6 @@ def keep_vector(buffer, row, vector):
 
 
 @jit
-def sort_by_length(buffer, total):
-    """Sort the segments by the number of cells that they cross, about."""
-    for first in range(0, total, LANES):
-        ray = load(buffer.content, first) & (LANES - 1)
-        speed = kept(buffer, SPEED_ROW, ray, numbers() + first < total)
-        cells = (load(buffer.end, first) - load(buffer.begin, first)) * speed
-        store(buffer.key, first, to_ints(min(max(cells, 0.0), BINS - 1.0)))
-    bins = buffer.bins
-    for b in range(BINS + 1):
-        bins[b] = 0
-    for n in range(total):
-        bins[buffer.key[n] + 1] += 1
-    for b in range(BINS):
-        bins[b + 1] += bins[b]
-    for n in range(total):
-        key = buffer.key[n]
-        buffer.order[bins[key]] = n
-        bins[key] += 1
-
-
-@jit
-def compose(buffer, total, depth):
-    """Put the segments behind what is known of their rays, front to back."""
-    sums = buffer.rays
-    for n in range(total):
-        at = TAU_ROW * LANES + (buffer.content[n] & (LANES - 1))
-        tau = sums[at]
-        sums[at] = tau + buffer.tau[n]
-        if depth is not None:
-            buffer.tau[n] = tau  # what lies before the segment
-    if depth is not None:
-        for first in range(0, total, LANES):
-            before = math.exp(-load(buffer.tau, first))
-            store(buffer.moment, first, before * load(buffer.moment, first))
-        for n in range(total):
-            sums[MOMENT_ROW * LANES + (buffer.content[n] & (LANES - 1))] += buffer.moment[n]
-
-
-@jit
 def to_local(m, vectors, row, mask, w):
     """`rays.to_local`, for each lane its own row."""
     x = gather(vectors, row * 3, mask)
@@ -130,7 +80,9 @@ def to_local(m, vectors, row, mask, w):
 
 
 @jit
-def packet(rays, t_far, alive, density, step, nearest, depth, skip_background, buffer):
+def packet(
+    rays, t_far, alive, density, step, nearest, bounds, tint, depth, skip_background, buffer, more
+):
     """Integrate the rays of a packet, from where they enter the volume; returns cells, INTS.
 
     What becomes of them stands in the buffer's rows of sums.
@@ -146,6 +98,7 @@ def packet(rays, t_far, alive, density, step, nearest, depth, skip_background, b
     keep(buffer, STEP_ROW, speed if step is None else step)
     keep(buffer, TAU_ROW, floats(0.0))
     keep(buffer, MOMENT_ROW, floats(0.0))
+    keep(buffer, SLACK_ROW, floats(0.0))
     at = enter(grid, rays, alive)
     t = floats(0.0)
     while any_of(alive):
@@ -156,17 +109,30 @@ def packet(rays, t_far, alive, density, step, nearest, depth, skip_background, b
         total = root_segments(grid, skip_background, rays, entry, corner, t, t_exit, met, buffer)
         if total > 0:
             keep_vector(buffer, CORNER_ROW, corner)
-            sort_by_length(buffer, total)
-            if step is not None:
-                cells = midpoint_segments(grid, density.scale, nearest, depth, buffer, total)
+            if bounds is not None:
+                cells = bounded_segments(
+                    grid, bounds, density.scale, nearest, depth, tint, t, t_exit, more, total
+                )
             else:
-                cells = exact_segments(grid, density.scale, nearest, depth, buffer, total)
+                sort_by_length(buffer, total)
+                if step is not None:
+                    cells = midpoint_segments(grid, density.scale, nearest, depth, buffer, total)
+                else:
+                    cells = exact_segments(grid, density.scale, nearest, depth, buffer, total)
+                compose(buffer, total, depth)
             evaluated = evaluated + cells
-            compose(buffer, total, depth)
         t = max(t, t_exit)
         at, known = root_next(grid, rays, at, planes)
         alive = alive & known & (t < t_far)
     return evaluated
+
+
+@jit
+def write_errors(buffer, tint, first, error):
+    """Write what the rays of a packet, ``first`` and following, are off by at most."""
+    for lane in range(min(LANES, len(error) - first)):
+        tau = buffer.rays[TAU_ROW * LANES + lane]
+        error[first + lane] = error_of(tau, buffer.rays[SLACK_ROW * LANES + lane], tint)
 
 
 @kernel
@@ -182,11 +148,12 @@ def integrate_packets(
     error,
     optical_depth,
     buffer,
+    more,
 ):
     """Integrate a batch of rays; parameters and result are those of `rays.integrate_rays`, whose
     terms that are missing here are out.
 
-    ``buffer`` is a `packet_buffer`.
+    ``buffer`` and ``more`` are a `packet_buffer`.
     """
     skip_background = density.skip_background
     m, box = density.local_from_world, density.support
@@ -221,9 +188,12 @@ def integrate_packets(
                 density,
                 step,
                 nearest,
+                bounds,
+                tint,
                 depth,
                 skip_background,
                 buffer,
+                more,
             )
             tau = load(buffer.rays, TAU_ROW * LANES)
             if depth is not None:
@@ -231,6 +201,8 @@ def integrate_packets(
                 some = hit > 0.0
                 moment = load(buffer.rays, MOMENT_ROW * LANES)
                 distance = pick(some, t_near + moment / pick(some, hit, 1.0), distance)
+            if bounds is not None:
+                write_errors(buffer, tint, first, error)
         scatter(optical_depth, row, tau, here)
         if depth is not None:
             scatter(depth, row, distance, here)
