@@ -21,7 +21,7 @@ LAYERS = [
     {"bounds"},
     {"render"},
     {"config", "images", "warmup", "scene"},
-    {"opacity", "estimate", "reproduce"},
+    {"opacity", "estimate", "reproduce", "outputs"},
     {"run", "describe"},
     {"probe"},
     {"batch"},

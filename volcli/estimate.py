@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from volcli.bounds import BYTES_A_BRICK, BYTES_A_BRICK_OF_SOURCE
 from volcli.errors import UsageError, VolcliError
 from volcli.grids import GridHeader, Volume
 from volcli.grids.census import Census
@@ -53,6 +54,9 @@ def needed_memory(job: Job, plan: Plan, volumes: Volumes, pixels: int | None = N
         census = _census(volume, header, volume.path.stat().st_mtime_ns)
         most = max(most, held + census.mapped_bytes + census.loading_bytes)
         held += census.mapped_bytes + census.grid_bytes
+        if plan.max_error is not None:
+            dense = header is plan.density
+            held += census.bricks * (BYTES_A_BRICK if dense else BYTES_A_BRICK_OF_SOURCE)
     return max(most, held + _picture(job, pixels))
 
 

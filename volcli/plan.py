@@ -235,6 +235,14 @@ def _terms(
         terms.append(Term("hit depth", True, why, evaluations=nodes))
     else:
         terms.append(Term("hit depth", False, "no EXR and no depth map is written"))
+    if job.quadrature.max_error:
+        why = (
+            f"off by at most {job.quadrature.max_error:g}, pixel by pixel: transmittance, and "
+            "radiance as a share of the brightest; not optical depth or hit depth"
+        )
+        terms.append(Term("error bound", True, why))
+    else:
+        terms.append(Term("error bound", False, "quadrature.max_error allows none"))
     if job.background.color is not None:
         terms.append(Term("background", True, "one colour"))
     elif job.background.image is not None:
@@ -248,6 +256,8 @@ def _how(job: Job) -> str:
     step = job.quadrature.step_voxels
     if step is not None:
         return f"sampled every {step:g} voxels"
+    if job.quadrature.max_error:
+        return "cell by cell, or larger parts as one where their bounds allow it"
     if job.density.interpolation == "nearest":
         return "a constant in each cell, exact"
     if job.density.ramp is not None:

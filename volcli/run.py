@@ -25,8 +25,9 @@ from volcli.estimate import check_memory
 from volcli.grids import Cache, GridHeader, Progress
 from volcli.grids.threads import threads_limited_to
 from volcli.memory import memory_limited_to
+from volcli.outputs import outputs, write_outputs
 from volcli.plan import Plan, make_plan
-from volcli.render import RenderResult, Scene, Window, make_integrator, over, render
+from volcli.render import RenderResult, Scene, Window, make_integrator, render
 from volcli.reproduce import naming_the_ray
 from volcli.scene import Volumes, make_scene, open_volumes, read_grids, scene_box
 from volcli.schema import DEFAULT_FOV, Job
@@ -116,6 +117,8 @@ class Report:
         ``load``, ``compile``, ``render``, ``write``.
     transmittance
         ``min``, ``mean``, ``max`` over the pixels.
+    error_bound
+        The largest of all pixels' certified errors; None where none was allowed.
     """
 
     image: str | None
@@ -126,6 +129,7 @@ class Report:
     cells: int
     seconds: dict[str, float]
     transmittance: dict[str, float]
+    error_bound: float | None
     camera: dict[str, Any]
     peak_memory_bytes: int
     warnings: list[str]
@@ -324,7 +328,24 @@ def write(
     """The second half of `run`: arrays to files."""
     job, result, seconds = rendered.job, rendered.result, dict(rendered.seconds)
     writing = time.perf_counter()
-    maps, notes = _write(prepared, result, job, seconds, overwrite, on_stage)
+    header: dict[str, str | int | float] = {
+        "Software": f"volcli {volcli.__version__}",
+        "volcli:version": volcli.__version__,
+        "volcli:rule": prepared.plan.rule,
+        "volcli:job": job_as_toml(job),
+        **{f"volcli:seconds_{name}": float(value) for name, value in seconds.items()},
+    }
+    if result.error_bound is not None:
+        header["volcli:error_bound"] = float(result.error_bound.max())
+    maps, notes = write_outputs(
+        prepared.files,
+        result,
+        prepared.background,
+        header,
+        bits=job.output.bits,
+        overwrite=overwrite,
+        on_stage=on_stage,
+    )
     seconds["write"] = time.perf_counter() - writing
     picture = prepared.files.get("picture")
     width, height = job.camera.size
@@ -341,6 +362,7 @@ def write(
             "mean": float(result.transmittance.mean(dtype=np.float64)),
             "max": float(result.transmittance.max()),
         },
+        error_bound=None if result.error_bound is None else float(result.error_bound.max()),
         camera=job.camera.model_dump(mode="json", exclude_none=True),
         peak_memory_bytes=peak_memory_bytes(),
         warnings=[*rendered.warnings, *notes],
@@ -364,17 +386,6 @@ def peak_memory_bytes() -> int:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
-def outputs(job: Job) -> dict[str, Path]:
-    """What the job writes: the picture and, beside it, ``<stem>.<map>.<ext>``; may be nothing."""
-    picture = job.output.image
-    if picture is None:
-        return {}
-    files = {"picture": picture}
-    for name in job.output.maps:
-        files[name] = picture.with_name(f"{picture.stem}.{name}{picture.suffix}")
-    return files
-
-
 def _resolved(job: Job, camera: Camera) -> Job:
     """The job with what was chosen for it filled in, so that it makes the same picture anywhere."""
     chosen: dict[str, Any] = {
@@ -394,53 +405,3 @@ def _resolved(job: Job, camera: Camera) -> Job:
         if path is not None:
             parts[part] = table.model_copy(update={name: path.absolute()})
     return job.model_copy(update=parts)
-
-
-def _write(
-    prepared: Prepared,
-    result: RenderResult,
-    resolved: Job,
-    seconds: dict[str, float],
-    overwrite: bool,
-    on_stage: OnStage,
-) -> tuple[dict[str, dict[str, Any]], list[str]]:
-    """Write the picture and the maps; returns what was written of maps, and warnings."""
-    header: dict[str, str | int | float] = {
-        "Software": f"volcli {volcli.__version__}",
-        "volcli:version": volcli.__version__,
-        "volcli:rule": prepared.plan.rule,
-        "volcli:job": job_as_toml(resolved),
-        **{f"volcli:seconds_{name}": float(value) for name, value in seconds.items()},
-    }
-    layers = {
-        "transmittance": result.transmittance,
-        "opacity": result.opacity,
-        "optical_depth": result.optical_depth,
-        "depth": result.depth,
-    }
-    warnings: list[str] = []
-    maps: dict[str, dict[str, Any]] = {}
-    for done, (name, path) in enumerate(prepared.files.items()):
-        on_stage("writing", done, len(prepared.files))
-        if name != "picture":
-            values = layers[name]
-            assert values is not None, "the plan evaluates what is written"
-            low, high = images.write_map(path, values, header, name=name, overwrite=overwrite)
-            maps[name] = {"file": str(path)}
-            if path.suffix.lower() == ".png":
-                maps[name] |= {"black": low, "white": high}
-            continue
-        picture = over(result, prepared.background)
-        if path.suffix.lower() == ".png":
-            warnings += images.write_png(
-                path, picture, header, bits=resolved.output.bits, overwrite=overwrite
-            )
-            continue
-        channels = {c: picture[..., i] for i, c in enumerate("RGBA")}
-        assert result.depth is not None, "the plan evaluates depth for an EXR"
-        channels["Z"] = result.depth
-        channels |= images.layer_channels("transmittance", result.transmittance)
-        channels |= images.layer_channels("optical_depth", result.optical_depth)
-        images.write_exr(path, channels, header, overwrite=overwrite)
-    on_stage("writing", len(prepared.files), len(prepared.files))
-    return maps, warnings

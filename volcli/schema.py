@@ -17,7 +17,7 @@ from volcli.sources import Color, DensityRamp, Emission
 
 Rule = Literal["exact", "midpoint"]
 Interpolation = Literal["linear", "nearest"]
-MapName = Literal["transmittance", "opacity", "optical_depth", "depth"]
+MapName = Literal["transmittance", "opacity", "optical_depth", "depth", "error_bound"]
 MAPS: tuple[str, ...] = get_args(MapName)
 
 FINEST_ERROR = 1e-6
@@ -281,6 +281,14 @@ class Job(Part):
             raise ValueError(
                 "density.scale is 0 and nothing is emitted, so there is nothing to see; give a "
                 "scale above 0, or an [emission]"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _bounds_are_of_an_error(self) -> Job:
+        if "error_bound" in self.output.maps and not self.quadrature.max_error:
+            raise ValueError(
+                "output.maps: error_bound is what quadrature.max_error certifies; give one above 0"
             )
         return self
 

@@ -22,7 +22,7 @@ from volcli.batch.schema import EXPANSIONS, Batch, Expansion
 from volcli.config import PATHS, from_folder, make_job, parse_setting, read_toml
 from volcli.errors import UsageError
 from volcli.images.paths import IMAGES
-from volcli.run import outputs
+from volcli.outputs import outputs
 from volcli.schema import Job
 from volcli.transforms import each_camera
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from volcli import run
 from volcli.batch import farm
 from volcli.batch.expand import Expanded, Item
 from volcli.batch.identity import job_hash
@@ -24,6 +23,7 @@ from volcli.errors import UsageError
 from volcli.estimate import PROCESS, estimate
 from volcli.leftovers import remove_leftovers
 from volcli.memory import SHARE, available_memory
+from volcli.outputs import outputs
 from volcli.render import available_threads
 
 CORES_PER_WORKER = 4
@@ -97,7 +97,7 @@ def list_jobs(expanded: Expanded) -> list[Listed]:
     for item in expanded.items:
         needs = estimate(item.job)
         state = "missing input" if item.missing else "to do"
-        if record.is_done(item.output, job_hash(item.job), run.outputs(item.job)):
+        if record.is_done(item.output, job_hash(item.job), outputs(item.job)):
             state = "done"
         listed.append(Listed(item, state, None if needs is None else PROCESS + needs))
     return listed
@@ -176,7 +176,7 @@ def _left_to_do(
     works = []
     for item in _by_volume(items):
         content = job_hash(item.job)
-        if not options.force and manifest.is_done(item.output, content, run.outputs(item.job)):
+        if not options.force and manifest.is_done(item.output, content, outputs(item.job)):
             tally.kept.append(item)
         else:
             works.append(Work(item, content, _needs(item, options.settings.tile)))

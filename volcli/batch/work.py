@@ -23,6 +23,7 @@ from volcli.batch.identity import Print, file_print
 from volcli.batch.volumes import KeptGrids
 from volcli.errors import UsageError, VolcliError
 from volcli.estimate import PROCESS
+from volcli.outputs import outputs
 from volcli.render import Window
 from volcli.schema import Job
 
@@ -157,7 +158,7 @@ class Worker:
         if task.window is not None:
             return Outcome(task.key, part=rendered)
         report = run.write(prepared, rendered)
-        named = run.outputs(task.job)
+        named = outputs(task.job)
         contents = {named[name]: path.read_bytes() for name, path in prepared.files.items()}
         return Outcome(task.key, report=renamed(report, task.job), contents=contents)
 
@@ -205,7 +206,7 @@ def prepare_into(job: Job, folder: Path) -> run.Prepared:
 
 def renamed(report: run.Report, job: Job) -> run.Report:
     """A report of files that were written elsewhere, with the names that the job has for them."""
-    named = run.outputs(job)
+    named = outputs(job)
     maps: dict[str, dict[str, Any]] = {
         name: {**told, "file": str(named[name])} for name, told in report.maps.items()
     }

@@ -191,6 +191,8 @@ def _as_json(told: Told) -> dict[str, Any]:
     if told.report is None:
         return {**row, "error": told.error}
     report = told.report
+    if report.error_bound is not None:
+        row["error_bound"] = report.error_bound
     return {
         **row,
         "size": report.size,

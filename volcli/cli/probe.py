@@ -209,7 +209,12 @@ def _bricks(found: dict[str, Any]) -> str:
     return table(head, rows, terminal_width()) + note
 
 
+def _certified(rule: dict[str, Any]) -> str:
+    return "-" if rule["error_bound"] is None else f"{rule['error_bound']:.1e}"
+
+
 def _rules(found: dict[str, Any]) -> str:
+    certified = any(rule["error_bound"] is not None for rule in found["rules"])
     rows = [
         [
             rule["rule"],
@@ -218,8 +223,11 @@ def _rules(found: dict[str, Any]) -> str:
             f"{rule['transmittance']:.8g}",
             ",".join(f"{v:.5g}" for v in rule["radiance"]),
             f"{rule['error']:.1e}",
+            *([_certified(rule)] if certified else []),
         ]
         for rule in found["rules"]
     ]
     head = ["rule", "evaluations", "optical depth", "transmittance", "radiance", "error of T"]
+    if certified:
+        head.append("certified")
     return table(head, rows, terminal_width())

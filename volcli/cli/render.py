@@ -41,6 +41,12 @@ def render(
     ortho: options.Ortho = None,
     image_size: options.Size = None,
     step: Annotated[float | None, option("quadrature.step", "--step", metavar="VOXELS")] = None,
+    max_error: Annotated[
+        float | None, option("quadrature.max_error", "--max-error", metavar="E")
+    ] = None,
+    target_error: Annotated[
+        float | None, option("quadrature.target_error", "--target-error", metavar="E")
+    ] = None,
     interpolation: options.Interpolation = None,
     background: Annotated[
         str | None,
@@ -121,8 +127,7 @@ def render(
     )
     flags += [
         ("output.image", "-o", output, output),
-        ("quadrature.rule", "--step", step, None if step is None else "midpoint"),
-        ("quadrature.step", "--step", step, step),
+        *options.rule_flags(step, max_error, target_error),
         ("output.maps", "--maps", maps, names(maps)),
         ("output.bits", "--bits", bits, bits),
         ("density.reader", "--reader", reader, reader),
@@ -199,11 +204,16 @@ def _render(
         held = _held(loaded.scene)
         if explain and not as_json:
             say(_explained(prepared.plan, held))
-            say(f"\nmemory: about {in_bytes(needed)} at its peak")
+            say(f"\nrule: {prepared.plan.rule}")
+            say(f"memory: about {in_bytes(needed)} at its peak")
         if not prepared.files:
             _warn([*prepared.plan.warnings, *loaded.warnings])
             if as_json:
-                explained = {"plan": _plan(prepared.plan, held), "memory_bytes": needed}
+                explained = {
+                    "rule": prepared.plan.rule,
+                    "plan": _plan(prepared.plan, held),
+                    "memory_bytes": needed,
+                }
                 say(json.dumps(explained, allow_nan=False))
             return
         if explain and not as_json:
@@ -218,14 +228,22 @@ def _render(
             if not quiet and None in (asked.eye, asked.target):
                 print(f"volcli: camera chosen: {_camera_flags(report.camera)}", file=sys.stderr)
             if as_json:
-                printed = asdict(report)
-                del printed["camera"]
+                printed = _printed(report)
                 if explain:
                     printed["plan"] = _plan(picture.plan, held)
                     printed["memory_bytes"] = needed
                 say(json.dumps(printed, allow_nan=False))
             else:
                 say(_summary(report))
+
+
+def _printed(report: Report) -> dict[str, Any]:
+    """A report as plain data: what there is of it."""
+    printed = asdict(report)
+    del printed["camera"]
+    if report.error_bound is None:
+        del printed["error_bound"]
+    return printed
 
 
 def _warn(warnings: Sequence[str]) -> None:
@@ -305,6 +323,11 @@ def _summary(report: Report) -> str:
         f"{report.rule}: {report.rays:,} rays, {report.cells:,} evaluations; transmittance "
         f"{t['min']:.4g} to {t['max']:.4g}, mean {t['mean']:.4g}"
     )
+    if report.error_bound is not None:
+        lines.append(
+            f"certified: no pixel's transmittance, nor its radiance as a share of the brightest "
+            f"light, is off by more than {report.error_bound:.3g}"
+        )
     lines.append(
         f"load {s['load']:.2f} s, compile {s['compile']:.2f} s, render {s['render']:.2f} s, "
         f"write {s['write']:.2f} s; peak memory {in_bytes(report.peak_memory_bytes)}"

@@ -89,6 +89,28 @@ def scene_flags(
     ]
 
 
+def rule_flags(
+    step: float | None, max_error: float | None, target_error: float | None
+) -> list[Flag]:
+    """The options that choose the rule of integration as settings of the job.
+
+    Raises
+    ------
+    UsageError
+        Two exclude each other.
+    """
+    given = {"--step": step, "--max-error": max_error, "--target-error": target_error}
+    named = [flag for flag, value in given.items() if value is not None]
+    if len(named) > 1:
+        raise UsageError(f"{' and '.join(named)} exclude each other; give one")
+    return [
+        ("quadrature.rule", "--step", step, None if step is None else "midpoint"),
+        ("quadrature.step", "--step", step, step),
+        ("quadrature.max_error", "--max-error", max_error, max_error),
+        ("quadrature.target_error", "--target-error", target_error, target_error),
+    ]
+
+
 def values_of(flags: Sequence[Flag]) -> list[tuple[str, Any]]:
     """(key, value) of the options that were given."""
     return [(key, value) for key, _, _, value in flags if value is not None]

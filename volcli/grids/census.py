@@ -30,6 +30,8 @@ class Census:
         What the tree takes while the bricks are built of it.
     grid_bytes
         What the bricks take.
+    bricks
+        That are built of it.
     mapped_bytes
         Of the file, as far as it is mapped into memory while it is read.
     """
@@ -38,6 +40,7 @@ class Census:
     tiles: int
     tree_bytes: int
     grid_bytes: int
+    bricks: int = 0
     mapped_bytes: int = 0
 
     @property
@@ -94,6 +97,7 @@ def census_of(
         tiles,
         leaves * (_LEAF_VOXELS * value_bytes + _LEAF_FIXED) + tiles * (17 + value_bytes),
         bricks * brick_bytes + blocks * (4 * LOWER**3 + 8) + roots * 4 * UPPER**3,
+        bricks,
         mapped_bytes,
     )
 

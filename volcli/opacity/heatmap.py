@@ -23,6 +23,7 @@ LABELS = {
     "transmittance": "transmittance, T",
     "optical_depth": "optical depth",
     "depth": "depth along the camera's axis, world units",
+    "error_bound": "certified error of transmittance and radiance",
 }
 
 _NOTHING = "0.8"  # the grey of pixels that have no value

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -31,6 +31,9 @@ MAP_HEADER = "volcli:map"
 
 SAME = 1e-6
 """A difference of opacity that is rounding."""
+
+ERRORS = ("error_bound",)
+"""The layers that say how far off a pixel may be."""
 
 NO_ALPHA = "no alpha: opaque"
 """The source of opacity of an image that says nothing of it."""
@@ -52,6 +55,8 @@ class Maps:
         (h, w) or, under a tint, (h, w, 3): what the background is multiplied by.
     source
         Map -> where its values come from, for people: ``layer transmittance.Y``.
+    errors
+        (h, w) float32 each: those of `ERRORS` that the image has.
     """
 
     stored: Channels
@@ -61,6 +66,7 @@ class Maps:
     depth: Floats | None
     through: Floats
     source: dict[str, str]
+    errors: dict[str, Floats] = field(default_factory=dict)
 
     @property
     def layers(self) -> dict[str, Floats]:
@@ -70,7 +76,7 @@ class Maps:
             "transmittance": self.transmittance,
             "optical_depth": self.optical_depth,
         }
-        return maps if self.depth is None else maps | {"depth": self.depth}
+        return maps | ({} if self.depth is None else {"depth": self.depth}) | self.errors
 
     @cached_property
     def job(self) -> dict[str, Any]:
@@ -134,7 +140,11 @@ def read_maps(path: str | os.PathLike[str]) -> Maps:
             f"{stored.path}: no alpha, and no layer of volcli's; it has: "
             f"{', '.join(stored.planes)}; render an .exr, or an image with alpha"
         )
-    return _completed(stored, opacity, transmittance, tau, stored.find("Z"), source)
+    layers = {name: stored.find(f"{name}.Y") for name in ERRORS}
+    errors = {name: layer for name, layer in layers.items() if layer is not None}
+    source |= {name: f"layer {name}" for name in errors}
+    maps = _completed(stored, opacity, transmittance, tau, stored.find("Z"), source)
+    return replace(maps, errors=errors)
 
 
 def job_of_picture(path: os.PathLike[str]) -> dict[str, Any]:

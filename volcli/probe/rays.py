@@ -84,12 +84,15 @@ def probe_job(
 
 
 def _rules(plan: Plan, steps: Sequence[float] | None) -> list[Plan]:
-    """The exact rule, with values blended and not, and midpoint with each step."""
+    """The exact rule, with values blended and not, the certified one if the job has it, and
+    midpoint with each step.
+    """
     if not steps:
         steps = [DEFAULT_STEP if plan.step_voxels is None else plan.step_voxels]
     exact = with_step(plan, None)
     other = replace(exact, nearest=not plan.nearest)
-    return [exact, *(with_step(plan, step) for step in steps), other]
+    certified = [] if plan.max_error is None else [plan]
+    return [exact, *certified, *(with_step(plan, step) for step in steps), other]
 
 
 def _short(scene: Scene, rule: Plan, origin: Any, direction: Any) -> bool:

@@ -43,7 +43,8 @@ def report(
     ``pixel``, ``origin``, ``direction``; ``range`` (near and far, or None); ``optical_depth``,
     ``transmittance``, ``opacity``, ``radiance``; ``distance`` and ``depth`` of a hit on average, or
     None; ``falls``: where T falls to each of `walk.FALLS`, or None; ``cells``: the columns of
-    `table`; ``bricks``; ``rules``, each with the error of its transmittance, and its samples.
+    `table`; ``bricks``; ``rules``, each with the error of its transmittance, what it certified of
+    it (or None), and its samples.
     """
     tau = walked.optical_depth if walked else 0.0
     distance = walked.distance if walked else None
@@ -148,6 +149,7 @@ def _rule(seen: Seen, walked: Walk | None, transmittance: float) -> dict[str, An
         "opacity": float(-np.expm1(-seen.tau)),
         "radiance": seen.radiance.tolist(),
         "error": abs(through - transmittance),
+        "error_bound": seen.error_bound,
         "samples": {"t": seen.samples.tolist(), "sigma": sigma.tolist()},
     }
 

@@ -10,7 +10,7 @@ from volcli.errors import UsageError
 from volcli.plan import Plan
 from volcli.probe.field import Floats
 from volcli.probe.walk import span
-from volcli.render import MAX_STEPS, Scene, Source, make_integrator
+from volcli.render import MAX_STEPS, PIXEL_ERROR, Scene, Source, make_integrator
 
 
 @dataclass(frozen=True)
@@ -20,13 +20,17 @@ class Seen:
     Attributes
     ----------
     rule
-        ``exact``, ``midpoint 0.5``, with ``, nearest`` where values are not blended.
+        ``exact``, ``midpoint 0.5``, ``certified 0.01``, with ``, nearest`` where values are not
+        blended.
     tau
         Optical depth.
     radiance
         (3,): the light of the volume alone.
     evaluations
-        Cells or samples.
+        Cells or samples, or parts taken as a whole.
+    error_bound
+        What transmittance, and radiance as a share of the brightest, is certified to be off by at
+        most; None of a rule that certifies nothing.
     samples
         (m,): distances from the origin of the samples of the midpoint rule; empty for others.
     """
@@ -35,6 +39,7 @@ class Seen:
     tau: float
     radiance: Floats
     evaluations: int
+    error_bound: float | None
     samples: Floats
 
 
@@ -49,13 +54,14 @@ def seen_by(scene: Scene, plan: Plan, origin: Floats, direction: Floats) -> Seen
     samples = np.empty(0)
     if plan.step_voxels is not None:
         samples = sample_distances(scene, plan, origin, direction)
-    tau, light, _, _, evaluations = make_integrator(scene, plan)(origin[None], direction[None])
+    tau, light, _, error, evaluations = make_integrator(scene, plan)(origin[None], direction[None])
     radiance = np.array(light[0], np.float64)
     if not isinstance(scene.color, Source):
         tint = 1.0 if scene.tint is None else np.array(scene.tint)
         radiance = radiance + -np.expm1(-tau[0] * tint) * np.array(scene.color)
     rule = plan.rule + (", nearest" if plan.nearest else "")
-    return Seen(rule, float(tau[0]), radiance, int(evaluations), samples)
+    bound = None if error is None else float(error[0]) + PIXEL_ERROR
+    return Seen(rule, float(tau[0]), radiance, int(evaluations), bound, samples)
 
 
 def with_step(plan: Plan, step_voxels: float | None) -> Plan:
