@@ -221,6 +221,8 @@ def test_an_option_that_sets_a_field_has_the_help_of_the_schema_and_no_default_o
         "ortho": "camera.width",
         "image_size": "camera.resolution",
         "step": "quadrature.step",
+        "max_error": "quadrature.max_error",
+        "target_error": "quadrature.target_error",
         "interpolation": "density.interpolation",
         "maps": "output.maps",
         "bits": "output.bits",
