@@ -31,6 +31,8 @@ class SceneBounds:
     ----------
     density
         (n, 9, 5) float32; see `kernels.bounds.Bounds`.
+    outlines, boxes
+        (n, 2) float32 and (n,) int32; None under a transfer function.
     colour, emission
         (m, 9, 2, 3) float32, or None where there is no such source.
     brightest
@@ -40,12 +42,14 @@ class SceneBounds:
     """
 
     density: NDArray[np.float32]
+    outlines: NDArray[np.float32] | None
+    boxes: NDArray[np.int32] | None
     colour: NDArray[np.float32] | None
     emission: NDArray[np.float32] | None
     brightest: float
 
 
-BYTES_A_BRICK = 9 * 5 * 4
+BYTES_A_BRICK = 9 * 5 * 4 + 2 * 4 + 4
 """What the bounds of a brick of density take."""
 
 BYTES_A_BRICK_OF_SOURCE = 9 * 2 * 3 * 4
@@ -65,10 +69,10 @@ def scene_bounds(scene: Scene, nearest: bool, threads: int | None = None) -> Sce
     threads
         Default: the processors that this process may use.
     """
-    colour = emission = None
+    colour = emission = outlines = boxes = None
     with threads_limited_to(threads):
         if scene.transfer is None:
-            density = density_bounds(scene.density, nearest)
+            density, outlines, boxes = density_bounds(scene.density, nearest)
         else:
             density = _transferred_bounds(scene, nearest)
         if isinstance(scene.color, tuple):
@@ -79,17 +83,24 @@ def scene_bounds(scene: Scene, nearest: bool, threads: int | None = None) -> Sce
         if scene.emission is not None:
             emission = source_bounds(scene.emission, nearest)
             brightest += _brightest(scene.emission, emission) * _diagonal(scene.emission.grid)
-    return SceneBounds(density, colour, emission, brightest)
+    return SceneBounds(density, outlines, boxes, colour, emission, brightest)
 
 
-def density_bounds(grid: BrickGrid, nearest: bool) -> NDArray[np.float32]:
-    """(n, 9, 5): the linear fits of each brick of a density and of its octants."""
+def density_bounds(
+    grid: BrickGrid, nearest: bool
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
+    """(n, 9, 5): the linear fits of each brick of a density and of its octants; (n, 2): the bricks'
+    outlines; (n,): their boxes."""
     from volcli.kernels.bounds import FIT, REGIONS, fit_bricks
 
     atlas = grid.arrays.atlas
     fits = np.empty((len(atlas), REGIONS, FIT), np.float32)
-    _by_parts(lambda part: fit_bricks(atlas[part], nearest, fits[part]), len(atlas))
-    return fits
+    outlines, boxes = np.empty((len(atlas), 2), np.float32), np.empty(len(atlas), np.int32)
+    _by_parts(
+        lambda part: fit_bricks(atlas[part], nearest, fits[part], outlines[part], boxes[part]),
+        len(atlas),
+    )
+    return fits, outlines, boxes
 
 
 def source_bounds(source: Source, nearest: bool) -> NDArray[np.float32]:

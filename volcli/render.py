@@ -357,7 +357,13 @@ def _kernel_bounds(scene: Scene, plan: Plan) -> Any:
     assert scene.bounds is not None, "made where a plan allows an error"
     made = scene.bounds
     return Bounds(
-        made.density, made.colour, made.emission, plan.max_error - 2 * PIXEL_ERROR, made.brightest
+        made.density,
+        made.outlines,
+        made.boxes,
+        made.colour,
+        made.emission,
+        plan.max_error - 2 * PIXEL_ERROR,
+        made.brightest,
     )
 
 

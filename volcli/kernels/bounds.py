@@ -1,4 +1,5 @@
-"""What is known of a brick and of its octants as a whole: a linear fit, and how far off it is.
+"""What is known of a brick and of its octants as a whole: a linear fit, and how far off it is;
+and where in a brick there is anything at all.
 
 A region is a brick (8 cells an edge) or one of its octants (4); ``REGIONS`` of them belong to a
 brick: the brick itself, then the octants, the z half fastest. Over a region the field is close to
@@ -11,6 +12,9 @@ points of the region, those on its far faces included, is a proof. With ``neares
 value, a is constant, and all cells were looked at.
 
 a, g and r are float32; r is taken after a and g were rounded, and rounded upwards.
+
+The **box** of a brick holds all its cells that are not 0 throughout: outside of it a ray has
+nothing to add up. Its least and largest corners, 0 to 8, take four bits each.
 """
 
 from __future__ import annotations
@@ -29,6 +33,10 @@ FIT = 5
 UPWARDS = 1.0 + 2.0**-22
 """Makes up for rounding to float32, and more."""
 
+OUTLINE, OCTANTS_FIT, LEAST = 2, 0, 1
+"""The length of an outline, and what its numbers are: the middling r of a brick's octants (of
+eight, the fourth smallest), and the brick's least value."""
+
 SMALLEST = 2.0**-149
 """The smallest number of float32: what an r that is not 0 may not be rounded below."""
 
@@ -41,6 +49,10 @@ class Bounds(NamedTuple):
     density
         (n, REGIONS, FIT) float32: of each brick of the density's atlas; under a transfer function
         of densities, not of the grid's values.
+    outlines
+        (n, 2) float32: see `OCTANTS_FIT`; None under a transfer function.
+    boxes
+        (n,) int32: `pack_box`; None as above.
     colour, emission
         (m, REGIONS, 2, 3) float32: the least and the largest of each channel in each region of the
         bricks of the source, scale and table applied; None where there is no such source.
@@ -51,6 +63,8 @@ class Bounds(NamedTuple):
     """
 
     density: NDArray[np.float32]
+    outlines: NDArray[np.float32] | None
+    boxes: NDArray[np.int32] | None
     colour: NDArray[np.float32] | None
     emission: NDArray[np.float32] | None
     max_error: float
@@ -108,9 +122,43 @@ def fit_region(values, number, nearest, fit):
     fit[4] = max(r * UPWARDS, SMALLEST) if r > 0.0 else 0.0
 
 
+@jit
+def outline_brick(values, nearest, fits, outline):
+    """Write the outline of a brick with these fits, and return its box."""
+    least = np.inf
+    reach = 0 if nearest else 1  # the cells that a value touches
+    lx = ly = lz = 8
+    hx = hy = hz = 0
+    points = 8 if nearest else 9
+    for i in range(points):
+        for j in range(points):
+            for k in range(points):
+                value = np.float64(values[(i * 9 + j) * 9 + k])
+                least = min(least, value)
+                if value != 0.0:
+                    lx, hx = min(lx, max(i - reach, 0)), max(hx, min(i + 1, 8))
+                    ly, hy = min(ly, max(j - reach, 0)), max(hy, min(j + 1, 8))
+                    lz, hz = min(lz, max(k - reach, 0)), max(hz, min(k + 1, 8))
+    outline[LEAST] = least
+    for octant in range(1, REGIONS):
+        below = equal = 0
+        for other in range(1, REGIONS):
+            below += fits[other, 4] < fits[octant, 4]
+            equal += fits[other, 4] == fits[octant, 4]
+        if below < 4 <= below + equal:
+            outline[OCTANTS_FIT] = fits[octant, 4]
+    return pack_box(min(lx, hx), min(ly, hy), min(lz, hz), hx, hy, hz)
+
+
+@jit
+def pack_box(lx, ly, lz, hx, hy, hz):
+    """A box as one number; its corners count cells from the brick's lowest."""
+    return lx | ly << 4 | lz << 8 | hx << 12 | hy << 16 | hz << 20
+
+
 @kernel
-def fit_bricks(atlas, nearest, fits):
-    """Write the fits of bricks.
+def fit_bricks(atlas, nearest, fits, outlines, boxes):
+    """Write the fits, outlines and boxes of bricks.
 
     Parameters
     ----------
@@ -120,7 +168,11 @@ def fit_bricks(atlas, nearest, fits):
         Whether values are those of cells.
     fits
         (n, REGIONS, FIT) float32, to be filled.
+    outlines, boxes
+        (n, 2) float32 and (n,) int32, to be filled; or None.
     """
     for brick in range(len(atlas)):
         for number in range(REGIONS):
             fit_region(atlas[brick], number, nearest, fits[brick, number])
+        if boxes is not None:
+            boxes[brick] = outline_brick(atlas[brick], nearest, fits[brick], outlines[brick])

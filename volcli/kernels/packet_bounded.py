@@ -8,15 +8,14 @@ of a ray summed up to D, its optical depth tau is off by at most D, and what it 
     exp(-tau) (exp(min(D, tau)) - 1)
 
 for true and computed tau are both at least 0. So a ray may give away D as long as that stays below
-the error E that is allowed. Before any brick is refined, the sum of all (tau - slack) is known, a
-lower bound of the ray's tau; behind an optical depth of log(1 / E) nearly everything may be taken
-as a whole.
+the error E that is allowed. A lower bound of tau is known beforehand, from the least values of the
+bricks: behind an optical depth of log(1 / E) nearly everything may be taken as a whole.
 
-What a ray may give away is shared out in proportion to length: what costs less than its share is
-taken as a whole, and what that leaves over is shared out again among the rest. A brick that costs
-more is cut into the octants that the ray crosses, and those that cost more than the brick's share
-(less what its octants before did not use) are walked cell by cell, exactly. All sums are of one
-ray, in its own order: its result does not depend on its packet.
+What a ray may give away is shared out in proportion to length. A brick that costs less than its
+share is taken as a whole. One whose octants mostly would is cut into those that the ray crosses,
+each taken as a whole if it costs less than the brick's share, less what its octants before did not
+use. All else is walked cell by cell, exactly, within the brick's box. All sums are of one ray, in
+its own order: its result does not depend on its packet.
 """
 
 from __future__ import annotations
@@ -27,11 +26,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from volcli.kernels.bounds import FIT, REGIONS
+from volcli.kernels.bounds import FIT, LEAST, OCTANTS_FIT, OUTLINE, REGIONS
 from volcli.kernels.cell import absorbed
 from volcli.kernels.compiler import jit
 from volcli.kernels.lane_memory import append, gather, load, scatter, store
-from volcli.kernels.lanes import LANES, any_of, count, floats, ints, numbers, pick, to_ints
+from volcli.kernels.lanes import (
+    LANES,
+    any_of,
+    count,
+    floats,
+    ints,
+    numbers,
+    pick,
+    to_floats,
+    to_ints,
+)
 from volcli.kernels.packet_rules import (
     FAR_ROW,
     SLACK_ROW,
@@ -44,33 +53,33 @@ from volcli.kernels.packet_rules import (
     make_buffer,
     sort_by_length,
 )
-from volcli.kernels.packet_walk import ROOM, Buffer, cross, enter_cube, exit_of, within
+from volcli.kernels.packet_walk import ROOM, Buffer, cross, enter_cube, exit_of, unpack, within
 
 PARTS = 4
 """Octants of a brick that a ray crosses at most."""
-
-ROUNDS = 3
-"""How often what is left over is shared out."""
 
 BEYOND = 500.0
 """Optical depth beyond which nothing is told apart: its exponential is in float64's range."""
 
 
-BEGIN_ROW, END_ROW, RATE_ROW, GIVE_ROW, LOW_ROW, DOUBT_ROW, SHARE_ROWS = 0, 1, 2, 3, 4, 5, 6
+BEGIN_ROW, END_ROW, RATE_ROW, LOW_ROW, DOUBT_ROW, SHARE_ROWS = 0, 1, 2, 3, 4, 5
 """Numbers of each ray while its allowance is shared out: where it enters and leaves the root cell,
-what it may give away in a unit of distance and in all, and two sums."""
+what it may give away in a unit of distance, a lower bound of its optical depth in the root cell,
+and the length of what is in doubt."""
 
 
 class BoundedBuffer(NamedTuple):
-    """Room for the segments of a packet as bricks, as the octants of bricks, and as both.
+    """Room for the segments of a packet as bricks, and as what those are taken as.
 
     Attributes
     ----------
     bricks, parts, flat
-        Parts ``PARTS * n`` and following are those of segment n; flat is what the rays are put
-        together from. They have one array of ``rays``.
+        Segment n is taken as the ``bricks.key[n]`` parts from ``PARTS * n`` on; flat is what the
+        rays are put together from. All three have one array of ``rays``.
     slack, part_slack
         (ROOM,), (PARTS * ROOM,) float64: what each optical depth is off by at most.
+    dear
+        (PARTS * ROOM,) int32: the parts that are walked cell by cell.
     shares
         (SHARE_ROWS * LANES,) float64.
     """
@@ -80,14 +89,22 @@ class BoundedBuffer(NamedTuple):
     flat: Buffer
     slack: NDArray[np.float64]
     part_slack: NDArray[np.float64]
+    dear: NDArray[np.int32]
     shares: NDArray[np.float64]
 
 
 def bounded_buffer(bricks: Buffer) -> BoundedBuffer:
     """An empty `BoundedBuffer` beside that of bricks."""
     parts, flat = (make_buffer(PARTS * ROOM)._replace(rays=bricks.rays) for _ in range(2))
-    shares = np.empty(SHARE_ROWS * LANES)
-    return BoundedBuffer(bricks, parts, flat, np.empty(ROOM), np.empty(PARTS * ROOM), shares)
+    return BoundedBuffer(
+        bricks,
+        parts,
+        flat,
+        np.empty(ROOM),
+        np.empty(PARTS * ROOM),
+        np.empty(PARTS * ROOM, np.int32),
+        np.empty(SHARE_ROWS * LANES),
+    )
 
 
 @jit
@@ -112,25 +129,25 @@ def region_sums(fits, scale, seg, region, corner, width, t, t_exit, mask, depth)
 
 
 @jit
-def whole_bricks(grid, fits, scale, depth, buffer, total):
-    """Every segment by the fit of its brick, or exactly where it is a constant."""
+def survey(grid, bounds, scale, buffer, total):
+    """Of every segment a lower bound of its optical depth, in ``bricks.tau``, and its slack; those
+    of a constant are exact."""
     bricks = buffer.bricks
     for first in range(0, total, LANES):
         here = numbers() + first < total
-        seg = fetch_at(bricks, numbers() + first, here)
-        solid = here & (seg.brick < 0)
+        brick = unpack(load(bricks.content, first))[0]
+        solid = here & (brick < 0)
         fitted = here & ~solid
-        t, t1 = seg.begin, seg.end
-        sums, slack = region_sums(fits, scale, seg, ints(0), seg.corner, 8.0, t, t1, fitted, depth)
+        length = scale * (load(bricks.end, first) - load(bricks.begin, first))
+        least = gather(bounds.outlines, brick * OUTLINE + LEAST, fitted)
         if any_of(solid):
-            zero = floats(0.0)
-            value = gather(grid.constants, -1 - seg.brick, solid)
-            p = (value, zero, zero, zero)
-            sums = add_cells(sums, p, scale, t, t1, solid, depth, seg.t_far)
-            slack = pick(solid, 0.0, slack)
-        store(bricks.tau, first, sums.tau)
-        store(bricks.moment, first, sums.moment)
-        store(buffer.slack, first, slack)
+            least = pick(solid, gather(grid.constants, -1 - brick, solid), least)
+        store(bricks.tau, first, least * length)
+        store(
+            buffer.slack,
+            first,
+            gather(bounds.density, brick * (REGIONS * FIT) + 4, fitted) * length,
+        )
 
 
 @jit
@@ -171,78 +188,113 @@ def share_out(error, tint, buffer, total):
     for row in (LOW_ROW, DOUBT_ROW):
         for lane in range(LANES):
             shares[row * LANES + lane] = 0.0
-    for n in range(total):  # a lower bound of tau, and how much of the ray is in doubt
+    for n in range(total):
         lane = bricks.content[n] & (LANES - 1)
-        slack = buffer.slack[n]
-        shares[LOW_ROW * LANES + lane] += max(bricks.tau[n] - slack, 0.0)
-        if slack > 0.0:
+        shares[LOW_ROW * LANES + lane] += bricks.tau[n]
+        if buffer.slack[n] > 0.0:
             shares[DOUBT_ROW * LANES + lane] += bricks.end[n] - bricks.begin[n]
     for lane in range(LANES):
         tau = sums[TAU_ROW * LANES + lane] + shares[LOW_ROW * LANES + lane]
-        left = allowance(error, tau, tint) - sums[SLACK_ROW * LANES + lane]
+        left = max(allowance(error, tau, tint) - sums[SLACK_ROW * LANES + lane], 0.0)
         begin, end = shares[BEGIN_ROW * LANES + lane], shares[END_ROW * LANES + lane]
-        far = sums[FAR_ROW * LANES + lane]
-        give = max(left, 0.0) * ((end - begin) / (far - begin) if end < far else 1.0)
-        doubt = shares[DOUBT_ROW * LANES + lane]
-        shares[GIVE_ROW * LANES + lane] = give
-        shares[RATE_ROW * LANES + lane] = give / doubt if doubt > 0.0 else 0.0
-    for _ in range(ROUNDS):
-        share_out_again(buffer, total)
+        far, doubt = sums[FAR_ROW * LANES + lane], shares[DOUBT_ROW * LANES + lane]
+        if end < far:
+            left *= (end - begin) / (far - begin)
+        shares[RATE_ROW * LANES + lane] = left / doubt if doubt > 0.0 else 0.0
 
 
 @jit
-def share_out_again(buffer, total):
-    """Share out among the bricks that cost more than their share what the others leave over."""
-    bricks, shares = buffer.bricks, buffer.shares
-    for row in (LOW_ROW, DOUBT_ROW):  # used, and how much of the ray is still in doubt
-        for lane in range(LANES):
-            shares[row * LANES + lane] = 0.0
-    for n in range(total):
-        lane = bricks.content[n] & (LANES - 1)
-        length = bricks.end[n] - bricks.begin[n]
-        if buffer.slack[n] <= shares[RATE_ROW * LANES + lane] * length:
-            shares[LOW_ROW * LANES + lane] += buffer.slack[n]
-        else:
-            shares[DOUBT_ROW * LANES + lane] += length
-    for lane in range(LANES):
-        doubt = shares[DOUBT_ROW * LANES + lane]
-        if doubt > 0.0:
-            left = shares[GIVE_ROW * LANES + lane] - shares[LOW_ROW * LANES + lane]
-            rate = shares[RATE_ROW * LANES + lane]
-            shares[RATE_ROW * LANES + lane] = max(rate, left / doubt)
+def clip_to_box(boxes, seg, mask):
+    """(t, t1): the part of each segment in the box of its brick; t >= t1 where there is none."""
+    box = gather(boxes, seg.brick, mask)
+    t, t1 = seg.begin, seg.end
+    for axis in range(3):
+        low = seg.corner[axis] + to_floats((box >> (4 * axis)) & 15) - seg.rays.o[axis]
+        high = seg.corner[axis] + to_floats((box >> (4 * axis + 12)) & 15) - seg.rays.o[axis]
+        still = seg.rays.still[axis]
+        a, b = low * seg.rays.inverse[axis], high * seg.rays.inverse[axis]
+        t = max(t, pick(still, t, min(a, b)))
+        t1 = min(t1, pick(still, t1, max(a, b)))
+        t1 = pick(still & ((low > 0.0) | (high < 0.0)), t, t1)
+    return t, t1
 
 
 @jit
-def list_dear(buffer, total):
-    """List the segments, in ``bricks.order``, that cost more than their share; returns how many."""
-    bricks = buffer.bricks
-    listed = 0
+def choose(bounds, scale, buffer, total):
+    """Say what each segment is taken as: listed in ``bricks.order``, a whole; in ``flat.order``,
+    octants; in ``dear``, cells. Returns the lengths of the three lists."""
+    bricks, parts = buffer.bricks, buffer.parts
+    whole = cut = dear = 0
     for first in range(0, total, LANES):
         place = numbers() + first
         here = place < total
-        rate = gather(
-            buffer.shares, (load(bricks.content, first) & (LANES - 1)) + RATE_ROW * LANES, here
-        )
+        content = load(bricks.content, first)
+        rate = gather(buffer.shares, (content & (LANES - 1)) + RATE_ROW * LANES, here)
         length = load(bricks.end, first) - load(bricks.begin, first)
-        dear = here & ~(load(buffer.slack, first) <= rate * length)
-        store(bricks.key, first, ints(0))
-        append(bricks.order, listed, place, dear)
-        listed += count(dear)
-    return listed
+        cheap = here & (load(buffer.slack, first) <= rate * length)
+        brick = unpack(content)[0]
+        doubtful = here & ~cheap
+        fit = gather(bounds.outlines, brick * OUTLINE + OCTANTS_FIT, doubtful)
+        divided = doubtful & (scale * fit <= rate)
+        walked = doubtful & ~divided
+        append(bricks.order, whole, place, cheap)
+        append(buffer.flat.order, cut, place, divided)
+        whole += count(cheap)
+        cut += count(divided)
+        store(bricks.key, first, ints(1))
+        if any_of(walked):
+            seg = fetch_at(bricks, place, walked)
+            t, t1 = clip_to_box(bounds.boxes, seg, walked)
+            part = place * PARTS
+            scatter(parts.begin, part, t, walked)
+            scatter(parts.end, part, t1, walked)
+            scatter(parts.content, part, content, walked)
+            scatter(parts.tau, part, floats(0.0), walked)
+            scatter(parts.moment, part, floats(0.0), walked)
+            scatter(buffer.part_slack, part, floats(0.0), walked)
+            walked = walked & (t < t1)
+            append(buffer.dear, dear, part, walked)
+            dear += count(walked)
+    return whole, cut, dear
 
 
 @jit
-def octants(fits, scale, depth, buffer, listed):
-    """Cut the listed segments into octants, each by its fit; ``bricks.key`` says how many.
-
-    Those that cost too much are listed in ``flat.order``, to be walked cell by cell. Returns
-    (octants that are not, INTS, how many are listed).
-    """
+def take_whole(grid, fits, scale, depth, buffer, listed):
+    """The listed segments by the fits of their bricks, or exactly where they are of a constant."""
     bricks, parts = buffer.bricks, buffer.parts
-    settled, used = ints(0), 0
     for first in range(0, listed, LANES):
         here = numbers() + first < listed
         place = pick(here, load(bricks.order, first), 0)
+        seg = fetch_at(bricks, place, here)
+        solid = here & (seg.brick < 0)
+        fitted = here & ~solid
+        t, t1 = seg.begin, seg.end
+        sums, slack = region_sums(fits, scale, seg, ints(0), seg.corner, 8.0, t, t1, fitted, depth)
+        if any_of(solid):
+            zero = floats(0.0)
+            value = gather(grid.constants, -1 - seg.brick, solid)
+            p = (value, zero, zero, zero)
+            sums = add_cells(sums, p, scale, t, t1, solid, depth, seg.t_far)
+            slack = pick(solid, 0.0, slack)
+        part = place * PARTS
+        scatter(parts.content, part, gather(bricks.content, place, here), here)
+        scatter(parts.tau, part, sums.tau, here)
+        scatter(parts.moment, part, sums.moment, here)
+        scatter(buffer.part_slack, part, slack, here)
+
+
+@jit
+def take_octants(fits, scale, depth, buffer, listed, dear):
+    """The listed segments as octants, each by its fit; ``bricks.key`` says how many.
+
+    Those that cost too much are added to the ``dear`` parts. Returns (octants that are not, INTS,
+    how many parts are dear).
+    """
+    bricks, parts = buffer.bricks, buffer.parts
+    settled = ints(0)
+    for first in range(0, listed, LANES):
+        here = numbers() + first < listed
+        place = pick(here, load(buffer.flat.order, first), 0)
         seg = fetch_at(bricks, place, here)
         content = gather(bricks.content, place, here)
         rate = gather(buffer.shares, (content & (LANES - 1)) + RATE_ROW * LANES, here)
@@ -257,7 +309,6 @@ def octants(fits, scale, depth, buffer, listed):
             region = to_ints(4.0 * x + 2.0 * y + z) + 1
             sums, slack = region_sums(fits, scale, seg, region, corner, 4.0, t, t_exit, met, depth)
             cheap = met & (given + slack <= rate * (t_exit - seg.begin))
-            dear = met & ~cheap
             part = place * PARTS + number
             scatter(parts.begin, part, t, met)
             scatter(parts.end, part, t_exit, met)
@@ -265,8 +316,8 @@ def octants(fits, scale, depth, buffer, listed):
             scatter(parts.tau, part, sums.tau, met)
             scatter(parts.moment, part, sums.moment, met)
             scatter(buffer.part_slack, part, pick(cheap, slack, 0.0), met)
-            append(buffer.flat.order, used, part, dear)
-            used += count(dear)
+            append(buffer.dear, dear, part, met & ~cheap)
+            dear += count(met & ~cheap)
             given = pick(cheap, given + slack, given)
             settled = pick(cheap, settled + 1, settled)
             number = pick(met, number + 1, number)
@@ -274,28 +325,22 @@ def octants(fits, scale, depth, buffer, listed):
             walk = cross(walk)
             active = active & (t_exit < t1) & within(walk, 2.0)
         scatter(bricks.key, place, number, here)
-    return settled, used
+    return settled, dear
 
 
 @jit
 def flatten(buffer, total):
-    """Put bricks and parts of bricks into one list, in order, and add up slacks; returns how many
+    """Put the parts of all segments into one list, in order, and add up slacks; returns how many
     there are."""
-    bricks, parts, flat = buffer.bricks, buffer.parts, buffer.flat
+    parts, flat = buffer.parts, buffer.flat
     used = 0
     for n in range(total):
-        at = SLACK_ROW * LANES + (bricks.content[n] & (LANES - 1))
-        if bricks.key[n] == 0:
-            flat.content[used] = bricks.content[n]
-            flat.tau[used] = bricks.tau[n]
-            flat.moment[used] = bricks.moment[n]
-            bricks.rays[at] += buffer.slack[n]
-            used += 1
-        for part in range(n * PARTS, n * PARTS + bricks.key[n]):
-            flat.content[used] = parts.content[part]
+        for part in range(n * PARTS, n * PARTS + buffer.bricks.key[n]):
+            content = parts.content[part]
+            flat.content[used] = content
             flat.tau[used] = parts.tau[part]
             flat.moment[used] = parts.moment[part]
-            bricks.rays[at] += buffer.part_slack[part]
+            flat.rays[SLACK_ROW * LANES + (content & (LANES - 1))] += buffer.part_slack[part]
             used += 1
     return used
 
@@ -309,11 +354,12 @@ def bounded_segments(grid, bounds, scale, nearest, depth, tint, t, t_exit, buffe
     """
     store(buffer.shares, BEGIN_ROW * LANES, t)
     store(buffer.shares, END_ROW * LANES, t_exit)
-    whole_bricks(grid, bounds.density, scale, depth, buffer, total)
+    survey(grid, bounds, scale, buffer, total)
     share_out(bounds.max_error, tint, buffer, total)
-    listed = list_dear(buffer, total)
-    settled, dear = octants(bounds.density, scale, depth, buffer, listed)
-    sort_by_length(buffer.parts, dear, buffer.flat.order)
+    whole, cut, dear = choose(bounds, scale, buffer, total)
+    take_whole(grid, bounds.density, scale, depth, buffer, whole)
+    settled, dear = take_octants(bounds.density, scale, depth, buffer, cut, dear)
+    sort_by_length(buffer.parts, dear, buffer.dear)
     cells = exact_segments(grid, scale, nearest, depth, buffer.parts, dear)
     compose(buffer.flat, flatten(buffer, total), depth)
-    return settled + cells + pick(numbers() == 0, ints(total - listed), 0)
+    return settled + cells + pick(numbers() == 0, ints(whole), 0)
