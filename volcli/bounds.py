@@ -69,21 +69,38 @@ def scene_bounds(scene: Scene, nearest: bool, threads: int | None = None) -> Sce
     threads
         Default: the processors that this process may use.
     """
-    colour = emission = outlines = boxes = None
+    outlines = boxes = None
     with threads_limited_to(threads):
         if scene.transfer is None:
             density, outlines, boxes = density_bounds(scene.density, nearest)
         else:
             density = _transferred_bounds(scene, nearest)
-        if isinstance(scene.color, tuple):
-            brightest = max(abs(channel) for channel in scene.color)
-        else:
-            colour = source_bounds(scene.color, nearest)
-            brightest = _brightest(scene.color, colour)
-        if scene.emission is not None:
-            emission = source_bounds(scene.emission, nearest)
-            brightest += _brightest(scene.emission, emission) * _diagonal(scene.emission.grid)
+        colour, emission, brightest = _lights(scene, nearest)
     return SceneBounds(density, outlines, boxes, colour, emission, brightest)
+
+
+def brightest_light(scene: Scene, nearest: bool, threads: int | None = None) -> float:
+    """`SceneBounds.brightest` of a scene whose bounds may not have been made."""
+    if scene.bounds is not None:
+        return scene.bounds.brightest
+    with threads_limited_to(threads):
+        return _lights(scene, nearest)[2]
+
+
+def _lights(
+    scene: Scene, nearest: bool
+) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None, float]:
+    """`SceneBounds.colour`, ``emission`` and ``brightest``."""
+    colour = emission = None
+    if isinstance(scene.color, tuple):
+        brightest = max(abs(channel) for channel in scene.color)
+    else:
+        colour = source_bounds(scene.color, nearest)
+        brightest = _brightest(scene.color, colour)
+    if scene.emission is not None:
+        emission = source_bounds(scene.emission, nearest)
+        brightest += _brightest(scene.emission, emission) * _diagonal(scene.emission.grid)
+    return colour, emission, brightest
 
 
 def density_bounds(
