@@ -196,7 +196,7 @@ def _value_ranges(grid: BrickGrid, nearest: bool) -> NDArray[np.float32]:
     from volcli.kernels.ranges import brick_ranges
 
     atlas = grid.arrays.atlas
-    atlas = atlas.reshape(len(atlas), 729, -1)
+    atlas = atlas if atlas.ndim == 3 else atlas[..., None]
     ranges = np.empty((len(atlas), REGIONS, 2, atlas.shape[2]), np.float32)
     _by_parts(lambda part: brick_ranges(atlas[part], nearest, ranges[part]), len(atlas))
     return ranges
