@@ -200,32 +200,28 @@ def _field(block, place, nearest):
 # --- from file to file ----------------------------------------------------------------------------
 
 
-def write_blocks(path, blocks, world, value_type="float", half=False):
-    """A .vdb file of blocks, active where they are; a tile of 8, 128 or 4096 as one value."""
-    tiles, points = {}, {}
+def grid_of(blocks, world, **grid):
+    """A grid of blocks, active where they are; a tile of 8, 128 or 4096 is one value."""
+    channels = (3,) if grid.get("value_type", "").startswith("vec3") else ()
+    tiles, leaves = {}, {}
     for block in blocks:
         if block.tile:
             tiles[block.low, block.high[0] - block.low[0] + 1] = (block.value, True)
             continue
         for at in np.ndindex(*np.subtract(block.high, block.low) + 1):
-            points[tuple(int(i) for i in np.add(block.low, at))] = block.value
-    leaves = {}
-    for point, value in points.items():
-        leaf = tuple(x & -8 for x in point)
-        if leaf not in leaves:
-            leaves[leaf] = (np.zeros((8, 8, 8)), np.zeros((8, 8, 8), bool))
-        inside = tuple(x & 7 for x in point)
-        leaves[leaf][0][inside], leaves[leaf][1][inside] = value, True
+            point = np.add(block.low, at)
+            leaf = tuple((point & -8).tolist())
+            if leaf not in leaves:
+                leaves[leaf] = (np.zeros((8, 8, 8, *channels)), np.zeros((8, 8, 8), bool))
+            inside = tuple(point & 7)
+            leaves[leaf][0][inside], leaves[leaf][1][inside] = block.value, True
     numbers = tuple(np.asarray(world, float).T.reshape(-1).tolist())
-    grid = Grid(
-        value_type=value_type,
-        leaves=leaves,
-        tiles=tiles,
-        half=half,
-        map_type="AffineMap",
-        map_numbers=numbers,
-    )
-    write_vdb(path, [grid])
+    return Grid(leaves=leaves, tiles=tiles, map_type="AffineMap", map_numbers=numbers, **grid)
+
+
+def write_blocks(path, blocks, world, **grid):
+    """A .vdb file of one grid of blocks."""
+    write_vdb(path, [grid_of(blocks, world, **grid)])
     return path
 
 
@@ -280,7 +276,7 @@ def see(case, folder, *rule):
     """What the picture of a row holds, under the rule that flags ask for: (channels, report)."""
     path = folder / "blocks.vdb"
     if not path.exists():
-        write_blocks(path, case.blocks, case.world, case.value_type, case.half)
+        write_blocks(path, case.blocks, case.world, value_type=case.value_type, half=case.half)
     return picture_of(path, [*flags_of(case), *rule], folder / "seen.exr")
 
 
