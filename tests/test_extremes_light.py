@@ -167,6 +167,7 @@ def test_a_certified_error_of_light_is_not_exceeded(lit, tmp_path):
     bound = seen["error_bound.Y"]
     assert bound == report.error_bound <= ALLOWED
     values = [abs(v) for b in (*lit.colour, *lit.flame) for v in b.value]
-    brightest = max(values) * (8 * lit.size if lit.flame else 1)
+    # Of what is emitted, the most that there can be along the diagonal of its box.
+    brightest = max(values) * (9 * np.sqrt(3) * lit.size if lit.flame else 1)
     for found, expected in zip(light, lit.light, strict=True):
         assert abs(found - expected) <= bound * brightest + 2.0**-149
