@@ -1,12 +1,13 @@
 """Volumes and views for the tests of images: made here, rendered by volcli and by the reference."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import reference
 
+from volcli.bounds import scene_bounds
 from volcli.camera import make_camera
 from volcli.grids.build import build
 from volcli.grids.tree import GridHeader, Tree
@@ -144,9 +145,9 @@ class _Memory:
         self.headers = headers
 
 
-def plan_for(layers=EVERYTHING, step=None, nearest=False):
+def plan_for(layers=EVERYTHING, step=None, nearest=False, max_error=None):
     """The plan that volcli makes for a scene; its grids are given to `shoot`."""
-    rule = {} if step is None else {"rule": "midpoint", "step": step}
+    rule = {"max_error": max_error} if step is None else {"rule": "midpoint", "step": step}
     job = Job(
         density={"interpolation": "nearest" if nearest else "linear"},
         quadrature=rule,
@@ -157,9 +158,16 @@ def plan_for(layers=EVERYTHING, step=None, nearest=False):
 def shoot(density, view, scale=1.0, colour=(1.0, 1.0, 1.0), threads=1, **plan):
     """Render a medium with volcli."""
     color = Source(colour.grid) if isinstance(colour, Medium) else colour
-    scene = Scene(density.grid, scale, color)
+    scene, made = bounded(Scene(density.grid, scale, color), plan_for(**plan))
     camera = view.camera if isinstance(view, View) else view
-    return render(scene, plan_for(**plan), camera, threads=threads)
+    return render(scene, made, camera, threads=threads)
+
+
+def bounded(scene, plan):
+    """(scene, plan), the scene with its bounds where the plan allows an error."""
+    if plan.max_error is None:
+        return scene, plan
+    return replace(scene, bounds=scene_bounds(scene, plan.nearest, 1)), plan
 
 
 def truth(density, view, scale=1.0, colour=None, nearest=False):

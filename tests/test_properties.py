@@ -9,28 +9,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-import scenes
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scenes import IDENTITY, Medium, View, affine, medium, rotation
+from scenes import IDENTITY, View, affine, medium, rotation, shoot
 
-from volcli.bounds import scene_bounds
-from volcli.plan import make_plan
-from volcli.render import Scene, Source, over, render
-from volcli.schema import Job
+from volcli.render import over
 
 RULES = {
     "exact": {},
-    "midpoint": {"quadrature": {"rule": "midpoint", "step": 0.7}},
-    "certified": {"quadrature": {"max_error": 0.05}},
-    "nearest": {"density": {"interpolation": "nearest"}},
-    "nearest, midpoint": {
-        "density": {"interpolation": "nearest"},
-        "quadrature": {"rule": "midpoint", "step": 0.7},
-    },
+    "midpoint": {"step": 0.7},
+    "certified": {"max_error": 0.05},
+    "nearest": {"nearest": True},
+    "nearest, midpoint": {"nearest": True, "step": 0.7},
 }
-"""What a job says of each."""
 
 ROUNDED = 3e-7
 """Relative: two results, each rounded to float32, and float64 before."""
@@ -101,15 +93,9 @@ DENSITIES = arrays(np.float32, (3, 4, 3), elements=st.floats(0, 8, width=32))
 COLOURS = arrays(np.float32, (3, 4, 3, 3), elements=st.floats(0, 4, width=32))
 
 
-def see(density, view, rule, scale=1.0, colour=(1.0, 1.0, 1.0), **camera):
+def see(density, view, rule, scale=1.0, colour=(1.0, 1.0, 1.0)):
     """Render a medium by one of the rules."""
-    job = Job(**RULES[rule])
-    plan = make_plan(job, scenes._Memory(scenes.header(IDENTITY)), scenes.EVERYTHING)
-    source = Source(colour.grid) if isinstance(colour, Medium) else colour
-    scene = Scene(density.grid, scale, source)
-    if plan.max_error is not None:
-        scene = replace(scene, bounds=scene_bounds(scene, plan.nearest, 1))
-    return render(scene, plan, view.camera, threads=1)
+    return shoot(density, view, scale, colour, **RULES[rule])
 
 
 def allowed(result):

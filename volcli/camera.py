@@ -67,11 +67,15 @@ class Camera:
     resolution: tuple[int, int]
     samples: Floats
 
-    def rays(self, rows: slice, columns: slice, samples: Floats = CENTRE) -> tuple[Floats, Floats]:
-        """Origins and unit directions of a rectangle of pixels, sample by sample, row by row.
+    def rays(
+        self, rows: slice, columns: slice | NDArray[np.int64], samples: Floats = CENTRE
+    ) -> tuple[Floats, Floats]:
+        """Origins and unit directions of pixels, sample by sample, row by row.
 
         Parameters
         ----------
+        rows, columns
+            Of the picture; of columns also their numbers.
         samples
             (n, 2): where in each pixel, as parts of its width and height; by default its centre.
 
@@ -123,7 +127,9 @@ class Camera:
         """
         if self.type == "panorama":
             return np.ones(len(directions))
-        return directions @ self.forward
+        # Not a matrix product, whose last bit depends on how many rays there are.
+        x, y, z = (directions[:, axis] * self.forward[axis] for axis in range(3))
+        return x + y + z
 
 
 def sample_positions(count: int) -> Floats:
