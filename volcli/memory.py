@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -168,3 +169,20 @@ def _left_in_cgroup() -> int | None:
                 left.append(int((group / limit).read_text()) - held)
             group = group.parent
     return min(left, default=None)
+
+
+def peak_memory_bytes() -> int:
+    """The most memory that this process has held.
+
+    Linux counts it afresh for each program in /proc; getrusage counts that of the program that
+    started this one as well.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        found = re.search(r"VmHWM:\s*(\d+) kB", status.read_text())
+        if found:
+            return int(found[1]) * 1024
+    import resource  # not on Windows, which volcli has not been tried on
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

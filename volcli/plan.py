@@ -65,6 +65,9 @@ class Plan:
         The midpoint rule's step, or None for the exact rule.
     max_error
         What the exact rule may be off by, to be certified; None: by nothing but rounding.
+    target_error
+        What the midpoint rule should be off by, where a pilot is still to choose its step
+        (`volcli.calibrate`); None where there is nothing to choose.
     nearest
         Whether values are those of the nearest voxel.
     terms
@@ -82,13 +85,17 @@ class Plan:
     depth: bool
     step_voxels: float | None
     max_error: float | None
+    target_error: float | None
     nearest: bool
     terms: tuple[Term, ...]
     warnings: tuple[str, ...]
 
     @property
     def rule(self) -> str:
-        """The rule of integration, for people: ``exact``, ``midpoint 0.5``, ``certified 0.01``."""
+        """The rule of integration, for people: ``exact``, ``midpoint 0.5``, ``certified 0.01``; and
+        ``calibrated 0.01`` as long as it is not chosen."""
+        if self.target_error is not None:
+            return f"calibrated {self.target_error:.3g}"
         if self.max_error is not None:
             return f"certified {self.max_error:g}"
         return "exact" if self.step_voxels is None else f"midpoint {self.step_voxels:g}"
@@ -136,6 +143,7 @@ def make_plan(
         depth="depth" in layers,
         step_voxels=job.quadrature.step_voxels,
         max_error=job.quadrature.max_error or None,  # 0 is exact
+        target_error=job.quadrature.target_error or None,
         nearest=job.density.interpolation == "nearest",
         terms=tuple(_terms(job, layers, (density, color, emission), files)),
         warnings=tuple(dict.fromkeys(warnings)),
@@ -256,6 +264,8 @@ def _how(job: Job) -> str:
     step = job.quadrature.step_voxels
     if step is not None:
         return f"sampled every {step:g} voxels"
+    if job.quadrature.target_error:
+        return "sampled at the longest step that a pilot finds good enough, or exact"
     if job.quadrature.max_error:
         return "cell by cell, or larger parts as one where their bounds allow it"
     if job.density.interpolation == "nearest":

@@ -6,11 +6,9 @@ results go to the caller.
 
 from __future__ import annotations
 
-import re
-import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,19 +16,20 @@ import numpy as np
 
 import volcli
 from volcli import images
+from volcli.calibrate import Pilot, calibrate
 from volcli.camera import Camera, make_camera
 from volcli.config import job_as_toml
 from volcli.errors import UsageError
 from volcli.estimate import check_memory
 from volcli.grids import Cache, GridHeader, Progress
 from volcli.grids.threads import threads_limited_to
-from volcli.memory import memory_limited_to
+from volcli.memory import memory_limited_to, peak_memory_bytes
 from volcli.outputs import outputs, write_outputs
 from volcli.plan import Plan, make_plan
 from volcli.render import RenderResult, Scene, Window, make_integrator, render
 from volcli.reproduce import naming_the_ray
 from volcli.scene import Volumes, make_scene, open_volumes, read_grids, scene_box
-from volcli.schema import DEFAULT_FOV, Job
+from volcli.schema import DEFAULT_FOV, Job, Quadrature
 from volcli.tables import ColorTable, check_maps
 from volcli.transforms import each_camera
 from volcli.warmup import StandIn, WarmUp
@@ -40,7 +39,8 @@ UNKNOWN_BOX = np.array([[-1.0] * 3, [1.0] * 3])
 
 OnStage = Callable[[str, int, int], None]
 """Called as ``on_stage(stage, done, total)``; a stage is one of ``reading GRID``, ``compiling`` (if
-there is something to compile), ``rendering``, ``writing``.
+there is something to compile), ``calibrating`` (if a step is to be chosen), ``rendering``,
+``writing``.
 """
 
 
@@ -91,6 +91,10 @@ class Rendered:
     ----------
     job
         The job with what was chosen for it filled in, so that it makes the same picture again.
+    rule
+        How it was rendered, for people.
+    pilot
+        What chose the step, or None where the job says how to render.
     result
         The arrays; its times, with that of loading, are in ``seconds``.
     warnings
@@ -98,6 +102,8 @@ class Rendered:
     """
 
     job: Job
+    rule: str
+    pilot: Pilot | None
     result: RenderResult
     seconds: dict[str, float]
     warnings: tuple[str, ...]
@@ -113,8 +119,10 @@ class Report:
         Files written; for a map of a PNG also the values that black and white stand for.
     camera
         Eye, target, up, and fov or width: as asked for or as chosen.
+    pilot
+        What chose the step, as plain data (see `calibrate.Pilot`); None where none was to choose.
     seconds
-        ``load``, ``compile``, ``render``, ``write``.
+        ``load``, ``compile``, ``render``, ``write``; ``pilot`` where there was one.
     transmittance
         ``min``, ``mean``, ``max`` over the pixels.
     error_bound
@@ -130,6 +138,7 @@ class Report:
     seconds: dict[str, float]
     transmittance: dict[str, float]
     error_bound: float | None
+    pilot: dict[str, Any] | None
     camera: dict[str, Any]
     peak_memory_bytes: int
     warnings: list[str]
@@ -281,6 +290,19 @@ def render_loaded(
     waited = time.perf_counter() - waiting
     from volcli.kernels.compiler import notes
 
+    pilot, seconds = None, {"load": loaded.seconds}
+    if plan.target_error is not None:
+        begin = time.perf_counter()
+        with naming_the_ray(job):
+            pilot = calibrate(
+                loaded.scene,
+                plan,
+                camera,
+                threads=threads,
+                progress=lambda d, n: on_stage("calibrating", d, n),
+            )
+        plan, job = pilot.settled(plan), _settled(job, pilot)
+        seconds["pilot"] = time.perf_counter() - begin
     with naming_the_ray(job):
         result = render(
             loaded.scene,
@@ -290,12 +312,13 @@ def render_loaded(
             window=window,
             progress=lambda d, n: on_stage("rendering", d, n),
         )
-    seconds = {
-        "load": loaded.seconds,
+    seconds |= {
         "compile": waited + result.compile_seconds,
         "render": result.render_seconds,
     }
-    return Rendered(job, result, seconds, (*plan.warnings, *loaded.warnings, *notes))
+    rule = plan.rule if pilot is None else f"{prepared.plan.rule}: {plan.rule}"
+    warnings = (*plan.warnings, *loaded.warnings, *notes)
+    return Rendered(job, rule, pilot, result, seconds, warnings)
 
 
 def _use_kernels(prepared: Prepared) -> None:
@@ -316,6 +339,8 @@ def _use_kernels(prepared: Prepared) -> None:
     scene, _ = make_scene(job, plan, volumes, grids, table=lambda *_: ramp)
     nothing = np.empty((0, 3))
     make_integrator(scene, plan)(nothing, nothing)
+    if plan.target_error is not None:
+        make_integrator(scene, replace(plan, step_voxels=1.0))(nothing, nothing)
 
 
 def write(
@@ -331,12 +356,15 @@ def write(
     header: dict[str, str | int | float] = {
         "Software": f"volcli {volcli.__version__}",
         "volcli:version": volcli.__version__,
-        "volcli:rule": prepared.plan.rule,
+        "volcli:rule": rendered.rule,
         "volcli:job": job_as_toml(job),
         **{f"volcli:seconds_{name}": float(value) for name, value in seconds.items()},
     }
     if result.error_bound is not None:
         header["volcli:error_bound"] = float(result.error_bound.max())
+    if rendered.pilot is not None:
+        header["volcli:target_error"] = rendered.pilot.target_error
+        header["volcli:pilot"] = f"an estimate: {rendered.pilot.said}"
     maps, notes = write_outputs(
         prepared.files,
         result,
@@ -353,7 +381,7 @@ def write(
         image=None if picture is None else str(picture),
         maps=maps,
         size=(width, height),
-        rule=prepared.plan.rule,
+        rule=rendered.rule,
         rays=width * height * job.camera.samples,
         cells=result.evaluations,
         seconds={name: round(value, 4) for name, value in seconds.items()},
@@ -363,27 +391,18 @@ def write(
             "max": float(result.transmittance.max()),
         },
         error_bound=None if result.error_bound is None else float(result.error_bound.max()),
+        pilot=None if rendered.pilot is None else rendered.pilot.as_data(),
         camera=job.camera.model_dump(mode="json", exclude_none=True),
         peak_memory_bytes=peak_memory_bytes(),
         warnings=[*rendered.warnings, *notes],
     )
 
 
-def peak_memory_bytes() -> int:
-    """The most memory that this process has held.
-
-    Linux counts it afresh for each program in /proc; getrusage counts that of the program that
-    started this one as well.
-    """
-    status = Path("/proc/self/status")
-    if status.exists():
-        found = re.search(r"VmHWM:\s*(\d+) kB", status.read_text())
-        if found:
-            return int(found[1]) * 1024
-    import resource  # not on Windows, which volcli has not been tried on
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
+def _settled(job: Job, pilot: Pilot) -> Job:
+    """The job with the rule that a pilot chose, so that it needs none again."""
+    step = pilot.step_voxels
+    chosen = Quadrature() if step is None else Quadrature(rule="midpoint", step=step)
+    return job.model_copy(update={"quadrature": chosen})
 
 
 def _resolved(job: Job, camera: Camera) -> Job:

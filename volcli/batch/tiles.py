@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from volcli.errors import VolcliError
 from volcli.render import RenderResult, Window
 from volcli.run import Rendered
 from volcli.schema import Job
@@ -43,7 +44,19 @@ class Canvas:
         return not self._open
 
     def put(self, window: Window, part: Rendered) -> None:
-        """Put a tile in its place."""
+        """Put a tile in its place.
+
+        Raises
+        ------
+        VolcliError
+            It was rendered by another rule than the others. Each of them chooses for the whole
+            picture, and machines of one kind choose the same.
+        """
+        if self._latest is not None and part.rule != self._latest.rule:
+            raise VolcliError(
+                f"tiles chose different rules, {self._latest.rule} and {part.rule}, as machines of "
+                "different kinds may; give the picture a quadrature.step"
+            )
         left, top, width, height = window
         for field in fields(RenderResult):
             values = getattr(part.result, field.name)

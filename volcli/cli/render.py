@@ -241,8 +241,9 @@ def _printed(report: Report) -> dict[str, Any]:
     """A report as plain data: what there is of it."""
     printed = asdict(report)
     del printed["camera"]
-    if report.error_bound is None:
-        del printed["error_bound"]
+    for name in ("error_bound", "pilot"):
+        if printed[name] is None:
+            del printed[name]
     return printed
 
 
@@ -323,13 +324,16 @@ def _summary(report: Report) -> str:
         f"{report.rule}: {report.rays:,} rays, {report.cells:,} evaluations; transmittance "
         f"{t['min']:.4g} to {t['max']:.4g}, mean {t['mean']:.4g}"
     )
+    pilot = f"pilot {s['pilot']:.2f} s, " if "pilot" in s else ""
+    if report.pilot is not None:
+        lines.append(f"an estimate: {report.pilot['said']}")
     if report.error_bound is not None:
         lines.append(
             f"certified: no pixel's transmittance, nor its radiance as a share of the brightest "
             f"light, is off by more than {report.error_bound:.3g}"
         )
     lines.append(
-        f"load {s['load']:.2f} s, compile {s['compile']:.2f} s, render {s['render']:.2f} s, "
+        f"load {s['load']:.2f} s, compile {s['compile']:.2f} s, {pilot}render {s['render']:.2f} s, "
         f"write {s['write']:.2f} s; peak memory {in_bytes(report.peak_memory_bytes)}"
     )
     return "\n".join(lines)

@@ -66,7 +66,7 @@ def seen_by(scene: Scene, plan: Plan, origin: Floats, direction: Floats) -> Seen
 
 def with_step(plan: Plan, step_voxels: float | None) -> Plan:
     """The plan with another rule: midpoint with a step, or exact."""
-    return replace(plan, step_voxels=step_voxels, max_error=None)
+    return replace(plan, step_voxels=step_voxels, max_error=None, target_error=None)
 
 
 def sample_count(scene: Scene, plan: Plan, origin: Floats, direction: Floats) -> float:
