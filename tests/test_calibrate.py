@@ -122,7 +122,7 @@ def test_error_of_colour_alone_shortens_the_step(tmp_path):
 def test_a_region_that_is_one_cell_is_rendered_exactly(tmp_path):
     # A constant of 128^3 voxels is one cell and many samples.
     write_vdb(tmp_path / "a.vdb", [Grid(tiles={((0, 0, 0), 128): (0.01, True)})])
-    pilot = chosen(tmp_path / "a.vdb", 0.001)
+    pilot = chosen(tmp_path / "a.vdb", 1e-4)
     assert pilot.step_voxels is None
     assert pilot.rays > 0
 
