@@ -14,7 +14,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 
 LAYERS = [
     {"errors", "fields", "srgb", "blackbody"},
-    {"memory", "leftovers"},
+    {"memory", "leftovers", "texts"},
     {"sources", "grids", "quadrature", "files"},
     {"schema"},
     {"plan", "camera", "transforms", "kernels", "tables", "columns"},

@@ -8,7 +8,6 @@ from __future__ import annotations
 import copy
 import difflib
 import itertools
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from pydantic import ValidationError
 from volcli.errors import UsageError
 from volcli.schema import Job, field, keys, table_of
 from volcli.sources import SOURCES
+from volcli.texts import parse_toml, read_text
 
 PATHS = (
     "density.file",
@@ -137,14 +137,14 @@ def read_toml(path: Path) -> dict[str, Any]:
         If the file cannot be read, or is not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return parse_toml(read_text(path))
     except FileNotFoundError as error:
         raise UsageError(f"{path}: no such job file; check the path") from error
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise UsageError(f"{path}: is not a text file in UTF-8") from error
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:
         raise UsageError(f"{path}: is not TOML: {error}") from error
 
 
@@ -176,8 +176,8 @@ def parse_setting(text: str) -> tuple[str, Any]:
     if not value.strip():
         return key, None
     try:
-        return key, tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+        return key, parse_toml(f"value = {value}")["value"]
+    except ValueError:
         return key, value.strip()
 
 

@@ -16,7 +16,6 @@ of another aspect it shows more or less above and below.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,6 +27,10 @@ from pydantic import ValidationError
 
 from volcli.errors import UsageError
 from volcli.schema import Camera, Job
+from volcli.texts import parse_json, read_text
+
+LARGEST = 1 << 26
+"""Bytes of a transforms.json: a hundred thousand frames."""
 
 SYNTHETIC_SIZE = (800, 800)
 """Width and height of the pictures of NeRF's synthetic scenes, whose files do not name it."""
@@ -95,12 +98,12 @@ class _Wrong(Exception):
 def _read(path: Path) -> dict[str, Any]:
     """The file's object, with a list of objects under ``frames``."""
     try:
-        document = json.loads(path.read_text(encoding="utf-8-sig"))
+        document = parse_json(read_text(path, LARGEST))
     except FileNotFoundError as error:
         raise UsageError(f"{path}: no such file (camera.transforms); check the path") from error
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, RecursionError) as error:  # of UTF-8, and of JSON
+    except ValueError as error:  # of UTF-8, and of JSON
         raise UsageError(f"{path}: is not JSON: {error}") from error
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):

@@ -50,7 +50,7 @@ def read_manifest(path: Path) -> list[dict[str, Any]]:
     for line in lines:
         try:
             event = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             continue  # cut off by a kill; what it told of is done again
         if isinstance(event, dict) and isinstance(event.get("job", ""), str) and "event" in event:
             events.append(event)

@@ -24,9 +24,11 @@ def open_volume(path: Path, reader: str = "volcli") -> Volume:
     VolumeError
         If there is no such file, or it is no volume.
     """
-    if path.is_dir():
-        raise VolumeError(f"{path}: is a folder; give a volume file (.vdb, .npy or .npz)")
     try:
+        if path.is_dir():
+            raise VolumeError(f"{path}: is a folder; give a volume file (.vdb, .npy or .npz)")
+        if path.exists() and not path.is_file():  # a pipe or a device may have no end
+            raise VolumeError(f"{path}: is no regular file; give a volume file")
         with path.open("rb") as file:
             start = file.read(8)
     except FileNotFoundError as error:

@@ -70,7 +70,7 @@ def read_stored(path: Path) -> tuple[NDArray[np.float32], "oiio.ImageSpec", str]
 
 
 def check_is_file(path: Path) -> None:
-    """Refuse a path that leads to nothing, or to a folder, before it is opened as an image.
+    """Refuse a path that leads to nothing, to a folder or to a pipe, before it is opened.
 
     Raises
     ------
@@ -85,3 +85,5 @@ def check_is_file(path: Path) -> None:
         raise UsageError(f"{path}: no such file; check the path")
     if stat.S_ISDIR(mode):
         raise UsageError(f"{path}: is a folder; name an image")
+    if not stat.S_ISREG(mode):  # it may have no end
+        raise UsageError(f"{path}: is no regular file; name an image")

@@ -10,7 +10,6 @@ other. Under a tint each layer has three channels; the maps are the means over t
 from __future__ import annotations
 
 import os
-import tomllib
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 
 from volcli.errors import UsageError
 from volcli.images import Channels, read_channels
+from volcli.texts import parse_toml
 
 Floats = NDArray[np.float32]
 
@@ -83,8 +83,8 @@ class Maps:
         """The tables of the job that the header holds; empty where it holds none."""
         text = self.stored.attributes.get(JOB_HEADER)
         try:
-            return tomllib.loads(str(text)) if text else {}
-        except tomllib.TOMLDecodeError:
+            return parse_toml(str(text)) if text else {}
+        except ValueError:
             return {}
 
     @property
@@ -160,8 +160,8 @@ def job_of_picture(path: os.PathLike[str]) -> dict[str, Any]:
     if not text:
         raise UsageError(f"{path}: its header holds no job; give the volume, or a job file")
     try:
-        return tomllib.loads(str(text))
-    except tomllib.TOMLDecodeError as error:
+        return parse_toml(str(text))
+    except ValueError as error:
         raise UsageError(f"{path}: the job in its header is damaged: {error}") from error
 
 
