@@ -5,9 +5,10 @@ A segment's optical depth by the linear fit of its brick is off by at most its *
 r times the extinction's scale times the segment's length (`bounds`). With the slacks of all parts
 of a ray summed up to D, its optical depth tau is off by at most D, and what it transmits by at most
 
-    exp(-tau) (exp(min(D, tau)) - 1)
+    exp(min(D, tau) - tau) (1 - exp(-D))
 
-for true and computed tau are both at least 0. So a ray may give away D as long as that stays below
+for the lesser of true and computed tau is at least tau - D and 0, and the greater at most D more.
+So a ray may give away D as long as that stays below
 the error E that is allowed. A lower bound of tau is known beforehand, from the least values of the
 bricks: behind an optical depth of log(1 / E) nearly everything may be taken as a whole.
 
@@ -169,11 +170,11 @@ def error_of(tau, slack, tint):
     """What the transmittance of a ray is off by at most, in any channel: `allowance`, backwards."""
     off = min(slack, tau)
     if tint is None:
-        return math.exp(off - tau) * absorbed(off)
+        return math.exp(off - tau) * absorbed(slack)
     most = 0.0
     for channel in range(3):
         k = tint[channel]
-        most = max(most, math.exp(k * (off - tau)) * absorbed(k * off))
+        most = max(most, math.exp(k * (off - tau)) * absorbed(k * slack))
     return most
 
 
