@@ -17,7 +17,9 @@ def main() -> int:
     parser.add_argument("--cases", type=int, default=2000, help="how many files")
     parser.add_argument("--first", type=int, default=0, help="the number of the first")
     parser.add_argument("--workers", type=int, default=1, help="processes at a time")
-    parser.add_argument("--kinds", default="", help="of vdb,npy,npz,exr,png,job,batch; none: all")
+    parser.add_argument(
+        "--kinds", default="", help="of vdb,npy,npz,exr,png,job,batch,json; none: all"
+    )
     parser.add_argument("--write", type=Path, help="write the file of case --first, and end")
     asked = parser.parse_args()
     if asked.write:

@@ -19,33 +19,50 @@ import sys
 import warnings
 from pathlib import Path
 
-from fuzz.mutate import ROOT, Case, case
+from fuzz.mutate import ROOT, Case, case, seeds
 from volcli.grids.vdb_codec import Cursor
 from volcli.run import peak_memory_bytes
 
 MEMORY = 3 * 2**30
+BALL = str(ROOT / "samples" / "rotated.vdb")
+SMALL = ["--size", "8x6", "--threads", "1", "--quiet"]
+KEPT = ("samples", "configs", "batch", "sound.exr")
 FAILURES = {0, 2, 3, 4, 5}
 """Exit codes that a damaged file may end with: an image, or an error that says what is wrong."""
 
 
 def commands(made: Case, file: Path, out: Path) -> list[list[str]]:
     """What reads a file of that kind."""
-    kind, ball = made.seed.kind, str(ROOT / "samples" / "rotated.vdb")
-    small = ["--size", "8x6", "--threads", "1", "--quiet"]
+    kind, name = made.seed.kind, str(file)
+    rendered = ["render", BALL, "-o", str(out), *SMALL]
+    # No picture: each kind of job has kernels to compile, which takes longer than a case may.
+    explained = ["--explain", "--json", "--set", "output.image=", *SMALL]
     if kind in ("vdb", "npy", "npz"):
         return [
-            ["render", str(file), "-o", str(out), *small, "--set", "density.nonfinite=zero"],
-            ["info", str(file), "--stats"],
+            ["render", name, "-o", str(out), *SMALL, "--set", "density.nonfinite=zero"],
+            [*rendered, *colored_by(name)],
+            ["info", name, "--stats"],
+            ["info", name, "--stats", "--json"],
         ]
     if kind in ("exr", "png"):
         return [
-            ["inspect", str(file)],
-            ["render", ball, "-o", str(out), *small, "--background", str(file)],
+            ["inspect", name, "--html", str(out.with_suffix(".html"))],
+            ["inspect", name, "--json"],
+            ["compare", name, str(out.parent / "sound.exr"), "--difference", str(out)],
+            ["recomposite", name, "-o", str(out), "--background", "1,0.5,0"],
+            ["probe", name, "--pixel", "1,1", "--json"],
+            [*rendered, "--background", name],
         ]
     if kind == "batch":
-        return [["batch", str(file), "--dry-run"]]
-    # No picture: each kind of job has kernels to compile, which takes longer than a case may.
-    return [["render", str(file), "--explain", "--json", "--set", "output.image=", *small]]
+        return [["batch", name, "--dry-run"]]
+    if kind == "json":
+        return [["render", BALL, *explained, "--set", f"camera.transforms={name}"]]
+    return [["render", name, *explained]]
+
+
+def colored_by(name: str) -> list[str]:
+    """Flags that take the colour from a file."""
+    return ["--set", f"color.file={name}", "--color-grid", "density"]
 
 
 def run(made: Case, folder: Path) -> dict[str, object]:
@@ -67,7 +84,7 @@ def run(made: Case, folder: Path) -> dict[str, object]:
     elif code and said.count("\n") > 40:
         told["found"] = f"{said.count(chr(10))} lines for one error"
     for path in folder.iterdir():
-        if path.name not in ("samples", "configs", "batch"):
+        if path.name not in KEPT:
             path.unlink()
     told["peak"] = peak_memory_bytes()
     return told
@@ -134,8 +151,12 @@ def main() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     # What is loaded and compiled once is not laid at the first case's door.
-    sound = [str(ROOT / "samples" / "rotated.vdb"), "-o", str(folder / "out.exr")]
-    code, said = _volcli(["render", *sound, "--size", "8x6", "--threads", "1"])
+    sound = ["render", BALL, "-o", str(folder / "sound.exr"), *SMALL]
+    vector = folder / "vector.vdb"
+    vector.write_bytes(next(seed.raw for seed in seeds() if "vec3s_224_0" in seed.name))
+    code, said = 0, ""
+    for command in (sound, [*sound, *colored_by(str(vector))]):
+        code, said = (code, said) if code else _volcli(command)
     answers.write("ready\n" if code == 0 else said)
     if asked.plant:
         plant(asked.plant)

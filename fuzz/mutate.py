@@ -6,6 +6,7 @@ the volumes beside the checkout where there are any.
 
 from __future__ import annotations
 
+import json
 import tempfile
 from dataclasses import dataclass
 from functools import cache
@@ -37,6 +38,7 @@ EXTREMES = [
     b"\1\0\0\0",
 ]
 NUMBERS = [b"-1", b"0", b"1e999", b"nan", b"99999999999", b"[]", b'"x"', b"1-999999999", b"true"]
+NUMBERS += [b"9" * 5000, b"[" * 5000, b"{a=" * 5000, b"a" + b".a" * 5000 + b"=1"]
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,8 @@ def _blow(raw: bytearray, rng: np.random.Generator, alike: list[Seed]) -> None:
             raw[at : at + (len(part) if rng.random() < 0.5 else 0)] = part
         case 8:  # a number of a text
             value = NUMBERS[rng.integers(len(NUMBERS))]
-            equals = raw.find(b"=", at)
+            mark = b":" if alike[0].kind == "json" else b"="
+            equals = raw.find(mark, at)
             if 0 <= equals < at + 200:
                 end = raw.find(b"\n", equals)
                 raw[equals + 1 : end if end > 0 else len(raw)] = value
@@ -129,6 +132,7 @@ def _written() -> list[Seed]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         _write_volumes(folder)
+        _write_cameras(folder)
         _write_images(folder)
         return [
             Seed(f"written/{path.name}", path.suffix[1:], path.read_bytes())
@@ -159,6 +163,17 @@ def _write_volumes(folder: Path) -> None:
     np.save(folder / "ball.npy", density)
     np.savez(folder / "ball.npz", density=density, voxel_size=0.5, origin=[0, 1, 2])
     np.savez_compressed(folder / "packed.npz", density=density, Cd=np.ones((9, 9, 9, 3)))
+
+
+def _write_cameras(folder: Path) -> None:
+    """Frames of a NeRF transforms.json, with each way to name a lens."""
+    pose = np.eye(4).tolist()
+    frames = [{"file_path": f"./r_{i}", "transform_matrix": pose} for i in range(3)]
+    lens = {"fl_x": 20, "fl_y": 20.5, "cx": 8, "cy": 6, "w": 16, "h": 12, "k1": 0}
+    synthetic = {"camera_angle_x": 0.6911, "frames": frames}
+    (folder / "synthetic.json").write_text(json.dumps(synthetic, indent=1))
+    measured = {"camera_model": "PINHOLE", **lens, "frames": frames}
+    (folder / "measured.json").write_text(json.dumps(measured, indent=1))
 
 
 def _write_images(folder: Path) -> None:

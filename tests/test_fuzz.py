@@ -33,4 +33,13 @@ def test_without_one_check_of_the_reader_the_harness_finds_something(check, foun
 
 def test_a_case_is_the_same_file_each_time_and_there_are_seeds_of_each_kind():
     assert case(7).raw == case(7).raw != case(8).raw
-    assert {seed.kind for seed in seeds()} == {"vdb", "npy", "npz", "exr", "png", "job", "batch"}
+    assert {seed.kind for seed in seeds()} == {
+        "vdb",
+        "npy",
+        "npz",
+        "exr",
+        "png",
+        "job",
+        "batch",
+        "json",
+    }
