@@ -31,8 +31,8 @@ class SceneBounds:
     ----------
     density
         (n, 9, 5) float32; see `kernels.bounds.Bounds`.
-    outlines, boxes
-        (n, 2) float32 and (n,) int32; None under a transfer function.
+    least, finest, boxes
+        (n,) float32, (n,) float32 and (n,) int32; None under a transfer function.
     colour, emission
         (m, 9, 2, 3) float32, or None where there is no such source.
     brightest
@@ -42,14 +42,15 @@ class SceneBounds:
     """
 
     density: NDArray[np.float32]
-    outlines: NDArray[np.float32] | None
+    least: NDArray[np.float32] | None
+    finest: NDArray[np.float32] | None
     boxes: NDArray[np.int32] | None
     colour: NDArray[np.float32] | None
     emission: NDArray[np.float32] | None
     brightest: float
 
 
-BYTES_A_BRICK = 9 * 5 * 4 + 2 * 4 + 4
+BYTES_A_BRICK = 9 * 5 * 4 + 3 * 4
 """What the bounds of a brick of density take."""
 
 BYTES_A_BRICK_OF_SOURCE = 9 * 2 * 3 * 4
@@ -69,14 +70,14 @@ def scene_bounds(scene: Scene, nearest: bool, threads: int | None = None) -> Sce
     threads
         Default: the processors that this process may use.
     """
-    outlines = boxes = None
+    colour = emission = least = finest = boxes = None
     with threads_limited_to(threads):
         if scene.transfer is None:
-            density, outlines, boxes = density_bounds(scene.density, nearest)
+            density, least, finest, boxes = density_bounds(scene.density, nearest)
         else:
             density = _transferred_bounds(scene, nearest)
         colour, emission, brightest = _lights(scene, nearest)
-    return SceneBounds(density, outlines, boxes, colour, emission, brightest)
+    return SceneBounds(density, least, finest, boxes, colour, emission, brightest)
 
 
 def brightest_light(scene: Scene, nearest: bool, threads: int | None = None) -> float:
@@ -103,21 +104,22 @@ def _lights(
     return colour, emission, brightest
 
 
-def density_bounds(
-    grid: BrickGrid, nearest: bool
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
-    """(n, 9, 5): the linear fits of each brick of a density and of its octants; (n, 2): the bricks'
-    outlines; (n,): their boxes."""
+def density_bounds(grid: BrickGrid, nearest: bool) -> tuple[Any, Any, Any, Any]:
+    """(n, 9, 5): the linear fits of each brick of a density and of its octants; (n,): the bricks'
+    least values; (n,): the smallest r of their octants; (n,): their boxes."""
     from volcli.kernels.bounds import FIT, REGIONS, fit_bricks
 
     atlas = grid.arrays.atlas
     fits = np.empty((len(atlas), REGIONS, FIT), np.float32)
-    outlines, boxes = np.empty((len(atlas), 2), np.float32), np.empty(len(atlas), np.int32)
+    least, finest = np.empty((2, len(atlas)), np.float32)
+    boxes = np.empty(len(atlas), np.int32)
     _by_parts(
-        lambda part: fit_bricks(atlas[part], nearest, fits[part], outlines[part], boxes[part]),
+        lambda part: fit_bricks(
+            atlas[part], nearest, fits[part], least[part], finest[part], boxes[part]
+        ),
         len(atlas),
     )
-    return fits, outlines, boxes
+    return fits, least, finest, boxes
 
 
 def source_bounds(source: Source, nearest: bool) -> NDArray[np.float32]:

@@ -358,7 +358,8 @@ def _kernel_bounds(scene: Scene, plan: Plan) -> Any:
     made = scene.bounds
     return Bounds(
         made.density,
-        made.outlines,
+        made.least,
+        made.finest,
         made.boxes,
         made.colour,
         made.emission,

@@ -33,10 +33,6 @@ FIT = 5
 UPWARDS = 1.0 + 2.0**-22
 """Makes up for rounding to float32, and more."""
 
-OUTLINE, OCTANTS_FIT, LEAST = 2, 0, 1
-"""The length of an outline, and what its numbers are: the middling r of a brick's octants (of
-eight, the fourth smallest), and the brick's least value."""
-
 SMALLEST = 2.0**-149
 """The smallest number of float32: what an r that is not 0 may not be rounded below."""
 
@@ -49,8 +45,9 @@ class Bounds(NamedTuple):
     density
         (n, REGIONS, FIT) float32: of each brick of the density's atlas; under a transfer function
         of densities, not of the grid's values.
-    outlines
-        (n, 2) float32: see `OCTANTS_FIT`; None under a transfer function.
+    least, finest
+        (n,) float32: the least value of each brick, and the smallest r of its octants; None under a
+        transfer function.
     boxes
         (n,) int32: `pack_box`; None as above.
     colour, emission
@@ -63,7 +60,8 @@ class Bounds(NamedTuple):
     """
 
     density: NDArray[np.float32]
-    outlines: NDArray[np.float32] | None
+    least: NDArray[np.float32] | None
+    finest: NDArray[np.float32] | None
     boxes: NDArray[np.int32] | None
     colour: NDArray[np.float32] | None
     emission: NDArray[np.float32] | None
@@ -123,8 +121,8 @@ def fit_region(values, number, nearest, fit):
 
 
 @jit
-def outline_brick(values, nearest, fits, outline):
-    """Write the outline of a brick with these fits, and return its box."""
+def outline_brick(values, nearest):
+    """(least value, `pack_box`) of a brick."""
     least = np.inf
     reach = 0 if nearest else 1  # the cells that a value touches
     lx = ly = lz = 8
@@ -139,15 +137,7 @@ def outline_brick(values, nearest, fits, outline):
                     lx, hx = min(lx, max(i - reach, 0)), max(hx, min(i + 1, 8))
                     ly, hy = min(ly, max(j - reach, 0)), max(hy, min(j + 1, 8))
                     lz, hz = min(lz, max(k - reach, 0)), max(hz, min(k + 1, 8))
-    outline[LEAST] = least
-    for octant in range(1, REGIONS):
-        below = equal = 0
-        for other in range(1, REGIONS):
-            below += fits[other, 4] < fits[octant, 4]
-            equal += fits[other, 4] == fits[octant, 4]
-        if below < 4 <= below + equal:
-            outline[OCTANTS_FIT] = fits[octant, 4]
-    return pack_box(min(lx, hx), min(ly, hy), min(lz, hz), hx, hy, hz)
+    return least, pack_box(min(lx, hx), min(ly, hy), min(lz, hz), hx, hy, hz)
 
 
 @jit
@@ -157,8 +147,8 @@ def pack_box(lx, ly, lz, hx, hy, hz):
 
 
 @kernel
-def fit_bricks(atlas, nearest, fits, outlines, boxes):
-    """Write the fits, outlines and boxes of bricks.
+def fit_bricks(atlas, nearest, fits, least, finest, boxes):
+    """Write what is known of bricks.
 
     Parameters
     ----------
@@ -168,11 +158,13 @@ def fit_bricks(atlas, nearest, fits, outlines, boxes):
         Whether values are those of cells.
     fits
         (n, REGIONS, FIT) float32, to be filled.
-    outlines, boxes
-        (n, 2) float32 and (n,) int32, to be filled; or None.
+    least, finest, boxes
+        (n,) float32, (n,) float32 and (n,) int32, to be filled.
     """
     for brick in range(len(atlas)):
         for number in range(REGIONS):
             fit_region(atlas[brick], number, nearest, fits[brick, number])
-        if boxes is not None:
-            boxes[brick] = outline_brick(atlas[brick], nearest, fits[brick], outlines[brick])
+        finest[brick] = fits[brick, 1, 4]
+        for octant in range(2, REGIONS):
+            finest[brick] = min(finest[brick], fits[brick, octant, 4])
+        least[brick], boxes[brick] = outline_brick(atlas[brick], nearest)

@@ -12,35 +12,35 @@ So a ray may give away D as long as that stays below
 the error E that is allowed. A lower bound of tau is known beforehand, from the least values of the
 bricks: behind an optical depth of log(1 / E) nearly everything may be taken as a whole.
 
-What a ray may give away is shared out in proportion to length. A brick that costs less than its
-share is taken as a whole. One whose octants mostly would is cut into those that the ray crosses,
-each taken as a whole if it costs less than the brick's share, less what its octants before did not
-use. All else is walked cell by cell, exactly, within the brick's box. All sums are of one ray, in
-its own order: its result does not depend on its packet.
+A segment is one part of a ray where its brick's fit is good, and else as many as there are octants
+that it crosses; only the brick's box counts, and octants that hold anything. What a ray may give
+away is shared out among its parts by length, at one rate, and what those that cost less leave over
+among the others, a few times over. A part that costs no more than the rate is taken by its fit; all
+others are walked cell by cell, exactly. All sums are of one ray, in its own order: its result does
+not depend on its packet.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba import literal_unroll
 from numpy.typing import NDArray
 
-from volcli.kernels.bounds import FIT, LEAST, OCTANTS_FIT, OUTLINE, REGIONS
+from volcli.kernels.bounds import FIT, REGIONS
 from volcli.kernels.cell import absorbed
 from volcli.kernels.compiler import jit
-from volcli.kernels.lane_memory import append, gather, load, scatter, store
+from volcli.kernels.lane_memory import gather, load, scatter, store
 from volcli.kernels.lanes import (
     LANES,
     any_of,
-    count,
     floats,
     ints,
     numbers,
     pick,
     to_floats,
-    to_ints,
 )
 from volcli.kernels.packet_rules import (
     FAR_ROW,
@@ -54,7 +54,7 @@ from volcli.kernels.packet_rules import (
     make_buffer,
     sort_by_length,
 )
-from volcli.kernels.packet_walk import ROOM, Buffer, cross, enter_cube, exit_of, unpack, within
+from volcli.kernels.packet_walk import ROOM, Buffer
 
 PARTS = 4
 """Octants of a brick that a ray crosses at most."""
@@ -63,92 +63,72 @@ BEYOND = 500.0
 """Optical depth beyond which nothing is told apart: its exponential is in float64's range."""
 
 
-BEGIN_ROW, END_ROW, RATE_ROW, LOW_ROW, DOUBT_ROW, SHARE_ROWS = 0, 1, 2, 3, 4, 5
+BEGIN_ROW, END_ROW, GIVE_ROW, RATE_ROW, SUM_ROW, DOUBT_ROW, SHARE_ROWS = 0, 1, 2, 3, 4, 5, 6
 """Numbers of each ray while its allowance is shared out: where it enters and leaves the root cell,
-what it may give away in a unit of distance, a lower bound of its optical depth in the root cell,
-and the length of what is in doubt."""
+what it may give away there in all and in a unit of distance; a sum, and the length in doubt."""
+
+ROUNDS = 1
+"""How often what cheap parts leave over is shared out."""
+
+CONSTANT = -1
+"""In place of the number of a region: none, but a constant."""
 
 
 class BoundedBuffer(NamedTuple):
-    """Room for the segments of a packet as bricks, and as what those are taken as.
+    """Room for the parts that the segments of a packet are cut into.
 
     Attributes
     ----------
-    bricks, parts, flat
-        Segment n is taken as the ``bricks.key[n]`` parts from ``PARTS * n`` on; flat is what the
-        rays are put together from. All three have one array of ``rays``.
-    slack, part_slack
-        (ROOM,), (PARTS * ROOM,) float64: what each optical depth is off by at most.
-    dear
-        (PARTS * ROOM,) int32: the parts that are walked cell by cell.
+    parts
+        `packet_walk.Buffer`; ``key`` is the region of a part, or `CONSTANT`. It has one array of
+        ``rays`` with the buffer of segments.
+    slack
+        (PARTS * ROOM,) float64: what the optical depth of each part is off by at most.
+    cheap, dear
+        (PARTS * ROOM,) int32: the parts taken by their fits, and those that are walked.
     shares
         (SHARE_ROWS * LANES,) float64.
+    starts
+        (LANES,) int64: where the parts of a segment begin.
     """
 
-    bricks: Buffer
     parts: Buffer
-    flat: Buffer
     slack: NDArray[np.float64]
-    part_slack: NDArray[np.float64]
+    cheap: NDArray[np.int32]
     dear: NDArray[np.int32]
     shares: NDArray[np.float64]
+    starts: NDArray[np.int64]
 
 
-def bounded_buffer(bricks: Buffer) -> BoundedBuffer:
-    """An empty `BoundedBuffer` beside that of bricks."""
-    parts, flat = (make_buffer(PARTS * ROOM)._replace(rays=bricks.rays) for _ in range(2))
+def bounded_buffer(segments: Buffer) -> BoundedBuffer:
+    """An empty `BoundedBuffer` beside that of segments."""
+    room = PARTS * ROOM
     return BoundedBuffer(
-        bricks,
-        parts,
-        flat,
-        np.empty(ROOM),
-        np.empty(PARTS * ROOM),
-        np.empty(PARTS * ROOM, np.int32),
+        make_buffer(room)._replace(rays=segments.rays),
+        np.empty(room),
+        np.empty(room, np.int32),
+        np.empty(room, np.int32),
         np.empty(SHARE_ROWS * LANES),
+        np.empty(LANES, np.int64),
     )
 
 
-@jit
-def region_sums(fits, scale, seg, region, corner, width, t, t_exit, mask, depth):
-    """(sums, slack) of [t, t_exit] by the fit of a region with lowest local voxel ``corner``."""
-    at = (seg.brick * REGIONS + region) * FIT
-    tm = 0.5 * (t + t_exit)
-    half = 0.5 * width
-    o, d = seg.rays.o, seg.rays.d
-    value = gather(fits, at, mask)
-    gx, gy, gz = gather(fits, at + 1, mask), gather(fits, at + 2, mask), gather(fits, at + 3, mask)
-    value = (
-        value
-        + gx * (o[0] + tm * d[0] - corner[0] - half)
-        + gy * (o[1] + tm * d[1] - corner[1] - half)
-        + gz * (o[2] + tm * d[2] - corner[2] - half)
-    )
-    zero = floats(0.0)
-    p = (value, gx * d[0] + gy * d[1] + gz * d[2], zero, zero)
-    sums = add_cells(Sums(zero, floats(1.0), zero), p, scale, t, t_exit, mask, depth, seg.t_far)
-    return sums, scale * gather(fits, at + 4, mask) * max(t_exit - t, 0.0)
+class Part(NamedTuple):
+    """A part of each of some segments; FLOATS, INTS and a MASK.
 
+    Attributes
+    ----------
+    begin, end, region, r
+        From and to where, of which region, and the r of its fit.
+    here
+        Where there is a part.
+    """
 
-@jit
-def survey(grid, bounds, scale, buffer, total):
-    """Of every segment a lower bound of its optical depth, in ``bricks.tau``, and its slack; those
-    of a constant are exact."""
-    bricks = buffer.bricks
-    for first in range(0, total, LANES):
-        here = numbers() + first < total
-        brick = unpack(load(bricks.content, first))[0]
-        solid = here & (brick < 0)
-        fitted = here & ~solid
-        length = scale * (load(bricks.end, first) - load(bricks.begin, first))
-        least = gather(bounds.outlines, brick * OUTLINE + LEAST, fitted)
-        if any_of(solid):
-            least = pick(solid, gather(grid.constants, -1 - brick, solid), least)
-        store(bricks.tau, first, least * length)
-        store(
-            buffer.slack,
-            first,
-            gather(bounds.density, brick * (REGIONS * FIT) + 4, fitted) * length,
-        )
+    begin: Any
+    end: Any
+    region: Any
+    r: Any
+    here: Any
 
 
 @jit
@@ -179,32 +159,6 @@ def error_of(tau, slack, tint):
 
 
 @jit
-def share_out(error, tint, buffer, total):
-    """Work out the rate of each ray: what it may give away in a unit of distance.
-
-    The rows of where the rays enter and leave the root cell are filled. What a ray may still give
-    away is shared out by length among the root cells to come, this one first.
-    """
-    bricks, shares, sums = buffer.bricks, buffer.shares, buffer.bricks.rays
-    for row in (LOW_ROW, DOUBT_ROW):
-        for lane in range(LANES):
-            shares[row * LANES + lane] = 0.0
-    for n in range(total):
-        lane = bricks.content[n] & (LANES - 1)
-        shares[LOW_ROW * LANES + lane] += bricks.tau[n]
-        if buffer.slack[n] > 0.0:
-            shares[DOUBT_ROW * LANES + lane] += bricks.end[n] - bricks.begin[n]
-    for lane in range(LANES):
-        tau = sums[TAU_ROW * LANES + lane] + shares[LOW_ROW * LANES + lane]
-        left = max(allowance(error, tau, tint) - sums[SLACK_ROW * LANES + lane], 0.0)
-        begin, end = shares[BEGIN_ROW * LANES + lane], shares[END_ROW * LANES + lane]
-        far, doubt = sums[FAR_ROW * LANES + lane], shares[DOUBT_ROW * LANES + lane]
-        if end < far:
-            left *= (end - begin) / (far - begin)
-        shares[RATE_ROW * LANES + lane] = left / doubt if doubt > 0.0 else 0.0
-
-
-@jit
 def clip_to_box(boxes, seg, mask):
     """(t, t1): the part of each segment in the box of its brick; t >= t1 where there is none."""
     box = gather(boxes, seg.brick, mask)
@@ -221,146 +175,253 @@ def clip_to_box(boxes, seg, mask):
 
 
 @jit
-def choose(bounds, scale, buffer, total):
-    """Say what each segment is taken as: listed in ``bricks.order``, a whole; in ``flat.order``,
-    octants; in ``dear``, cells. Returns the lengths of the three lists."""
-    bricks, parts = buffer.bricks, buffer.parts
-    whole = cut = dear = 0
-    for first in range(0, total, LANES):
-        place = numbers() + first
-        here = place < total
-        content = load(bricks.content, first)
-        rate = gather(buffer.shares, (content & (LANES - 1)) + RATE_ROW * LANES, here)
-        length = load(bricks.end, first) - load(bricks.begin, first)
-        cheap = here & (load(buffer.slack, first) <= rate * length)
-        brick = unpack(content)[0]
-        doubtful = here & ~cheap
-        fit = gather(bounds.outlines, brick * OUTLINE + OCTANTS_FIT, doubtful)
-        divided = doubtful & (scale * fit <= rate)
-        walked = doubtful & ~divided
-        append(bricks.order, whole, place, cheap)
-        append(buffer.flat.order, cut, place, divided)
-        whole += count(cheap)
-        cut += count(divided)
-        store(bricks.key, first, ints(1))
-        if any_of(walked):
-            seg = fetch_at(bricks, place, walked)
-            t, t1 = clip_to_box(bounds.boxes, seg, walked)
-            part = place * PARTS
-            scatter(parts.begin, part, t, walked)
-            scatter(parts.end, part, t1, walked)
-            scatter(parts.content, part, content, walked)
-            scatter(parts.tau, part, floats(0.0), walked)
-            scatter(parts.moment, part, floats(0.0), walked)
-            scatter(buffer.part_slack, part, floats(0.0), walked)
-            walked = walked & (t < t1)
-            append(buffer.dear, dear, part, walked)
-            dear += count(walked)
-    return whole, cut, dear
+def middle_planes(seg, t, t1, mask):
+    """Where the segments cross the planes between the octants of their bricks, in order; t1 where
+    they do not, or the mask does not hold."""
+    planes = (seg.end, seg.end, seg.end)
+    for axis in range(3):
+        plane = (seg.corner[axis] + 4.0 - seg.rays.o[axis]) * seg.rays.inverse[axis]
+        plane = pick(mask & ~seg.rays.still[axis], min(max(plane, t), t1), t1)
+        planes = (planes[1], planes[2], plane)
+    a, b = min(planes[0], planes[1]), max(planes[0], planes[1])
+    return min(a, planes[2]), max(a, min(b, planes[2])), max(b, planes[2])
 
 
 @jit
-def take_whole(grid, fits, scale, depth, buffer, listed):
-    """The listed segments by the fits of their bricks, or exactly where they are of a constant."""
-    bricks, parts = buffer.bricks, buffer.parts
-    for first in range(0, listed, LANES):
-        here = numbers() + first < listed
-        place = pick(here, load(bricks.order, first), 0)
-        seg = fetch_at(bricks, place, here)
-        solid = here & (seg.brick < 0)
-        fitted = here & ~solid
-        t, t1 = seg.begin, seg.end
-        sums, slack = region_sums(fits, scale, seg, ints(0), seg.corner, 8.0, t, t1, fitted, depth)
-        if any_of(solid):
-            zero = floats(0.0)
-            value = gather(grid.constants, -1 - seg.brick, solid)
-            p = (value, zero, zero, zero)
-            sums = add_cells(sums, p, scale, t, t1, solid, depth, seg.t_far)
-            slack = pick(solid, 0.0, slack)
-        part = place * PARTS
-        scatter(parts.content, part, gather(bricks.content, place, here), here)
-        scatter(parts.tau, part, sums.tau, here)
-        scatter(parts.moment, part, sums.moment, here)
-        scatter(buffer.part_slack, part, slack, here)
+def octant_part(fits, seg, t, t_exit, mask):
+    """The `Part` of each segment from t to t_exit; none where its octant is 0."""
+    tm = 0.5 * (t + t_exit)
+    o, d = seg.rays.o, seg.rays.d
+    region = (
+        pick(o[0] + tm * d[0] - seg.corner[0] < 4.0, ints(1), 5)
+        + pick(o[1] + tm * d[1] - seg.corner[1] < 4.0, ints(0), 2)
+        + pick(o[2] + tm * d[2] - seg.corner[2] < 4.0, ints(0), 1)
+    )
+    mask = mask & (t < t_exit)
+    at = (seg.brick * REGIONS + region) * FIT
+    r = gather(fits, at + 4, mask)
+    return Part(t, t_exit, region, r, mask & ((r > 0.0) | ~(gather(fits, at, mask) == 0.0)))
 
 
 @jit
-def take_octants(fits, scale, depth, buffer, listed, dear):
-    """The listed segments as octants, each by its fit; ``bricks.key`` says how many.
+def cut(grid, bounds, scale, segments, buffer, total):
+    """Cut the segments into parts; returns how many. ``parts.tau`` is a lower bound of the optical
+    depth of each.
 
-    Those that cost too much are added to the ``dear`` parts. Returns (octants that are not, INTS,
-    how many parts are dear).
+    The rate by which it is judged whether a brick is a part is twice that of a ray all of which is
+    in doubt.
     """
-    bricks, parts = buffer.bricks, buffer.parts
-    settled = ints(0)
-    for first in range(0, listed, LANES):
-        here = numbers() + first < listed
-        place = pick(here, load(buffer.flat.order, first), 0)
-        seg = fetch_at(bricks, place, here)
-        content = gather(bricks.content, place, here)
+    parts = 0
+    for first in range(0, total, LANES):
+        here = numbers() + first < total
+        seg = fetch_at(segments, numbers() + first, here)
+        content = load(segments.content, first)
+        solid = here & (seg.brick < 0)
+        here = here & ~solid
+        t, t1 = clip_to_box(bounds.boxes, seg, here)
+        t, t1 = pick(solid, seg.begin, t), pick(solid, seg.end, t1)
+        r = gather(bounds.density, seg.brick * (REGIONS * FIT) + 4, here)
         rate = gather(buffer.shares, (content & (LANES - 1)) + RATE_ROW * LANES, here)
-        t, t1 = seg.begin, seg.end
-        walk = enter_cube(seg.rays, t, seg.corner, 4.0, 2.0)
-        given, number, active = floats(0.0), ints(0), here
-        while any_of(active):
-            t_exit = exit_of(walk, t1)
-            x, y, z = walk.cell
-            corner = (seg.corner[0] + 4.0 * x, seg.corner[1] + 4.0 * y, seg.corner[2] + 4.0 * z)
-            met = active & (t_exit > t)
-            region = to_ints(4.0 * x + 2.0 * y + z) + 1
-            sums, slack = region_sums(fits, scale, seg, region, corner, 4.0, t, t_exit, met, depth)
-            cheap = met & (given + slack <= rate * (t_exit - seg.begin))
-            part = place * PARTS + number
-            scatter(parts.begin, part, t, met)
-            scatter(parts.end, part, t_exit, met)
-            scatter(parts.content, part, content, met)
-            scatter(parts.tau, part, sums.tau, met)
-            scatter(parts.moment, part, sums.moment, met)
-            scatter(buffer.part_slack, part, pick(cheap, slack, 0.0), met)
-            append(buffer.dear, dear, part, met & ~cheap)
-            dear += count(met & ~cheap)
-            given = pick(cheap, given + slack, given)
-            settled = pick(cheap, settled + 1, settled)
-            number = pick(met, number + 1, number)
-            t = max(t, t_exit)
-            walk = cross(walk)
-            active = active & (t_exit < t1) & within(walk, 2.0)
-        scatter(bricks.key, place, number, here)
-    return settled, dear
+        whole = here & (scale * r <= 2.0 * rate)
+        finest = gather(bounds.finest, seg.brick, here)
+        whole = whole | (here & (scale * finest > 2.0 * rate))  # its octants would be no better
+        divided = here & ~whole
+        least = gather(bounds.least, seg.brick, here)
+        if any_of(solid):
+            least = pick(solid, gather(grid.constants, -1 - seg.brick, solid), least)
+        region = pick(solid, ints(CONSTANT), 0)
+        if any_of(divided):
+            m = middle_planes(seg, t, t1, divided)
+            a = octant_part(bounds.density, seg, t, m[0], divided)
+            b = octant_part(bounds.density, seg, m[0], m[1], divided)
+            c = octant_part(bounds.density, seg, m[1], m[2], divided)
+            e = octant_part(bounds.density, seg, m[2], t1, divided)
+            whole = (whole | solid) & (t < t1)
+            a = Part(
+                t,
+                pick(divided, a.end, t1),
+                pick(divided, a.region, region),
+                pick(divided, a.r, r),
+                a.here | whole,
+            )
+            parts = put_parts(buffer, parts, (a, b, c, e), content, scale, least)
+        else:
+            one = Part(t, t1, region, r, (whole | solid) & (t < t1))
+            parts = put_parts(buffer, parts, (one,), content, scale, least)
+    return parts
 
 
 @jit
-def flatten(buffer, total):
-    """Put the parts of all segments into one list, in order, and add up slacks; returns how many
-    there are."""
-    parts, flat = buffer.parts, buffer.flat
-    used = 0
+def put_parts(buffer, parts, some, content, scale, least):
+    """Put down the parts of some segments, those of each in order; returns how many parts there
+    are then."""
+    number = ints(0)
+    for part in literal_unroll(some):
+        number = pick(part.here, number + 1, number)
+    store(buffer.starts, 0, number)
+    for lane in range(LANES):
+        more = buffer.starts[lane]
+        buffer.starts[lane] = parts
+        parts += more
+    place = load(buffer.starts, 0)
+    for part in literal_unroll(some):
+        length = scale * (part.end - part.begin)
+        scatter(buffer.parts.begin, place, part.begin, part.here)
+        scatter(buffer.parts.end, place, part.end, part.here)
+        scatter(buffer.parts.content, place, content, part.here)
+        scatter(buffer.parts.key, place, part.region, part.here)
+        scatter(buffer.parts.tau, place, least * length, part.here)
+        scatter(buffer.slack, place, part.r * length, part.here)
+        place = pick(part.here, place + 1, place)
+    return parts
+
+
+@jit
+def clear(shares):
+    """Begin sums anew."""
+    for lane in range(LANES):
+        shares[SUM_ROW * LANES + lane] = 0.0
+        shares[DOUBT_ROW * LANES + lane] = 0.0
+
+
+@jit
+def first_rate(error, tint, buffer):
+    """The rate of each ray were all of it in doubt and its optical depth 0."""
+    shares, sums = buffer.shares, buffer.parts.rays
+    give = allowance(error, 0.0, tint)
+    for lane in range(LANES):
+        length = max(sums[FAR_ROW * LANES + lane] - shares[BEGIN_ROW * LANES + lane], 0.0)
+        shares[RATE_ROW * LANES + lane] = give / length if length > 0.0 else 0.0
+
+
+@jit
+def share_out(error, tint, buffer, total):
+    """Work out what each ray may give away in this root cell, and its rate.
+
+    The rows of where the rays enter and leave the root cell are filled. What a ray may still give
+    away is shared out by length among the root cells to come, this one first.
+    """
+    parts, shares, sums = buffer.parts, buffer.shares, buffer.parts.rays
+    clear(shares)
     for n in range(total):
-        for part in range(n * PARTS, n * PARTS + buffer.bricks.key[n]):
-            content = parts.content[part]
-            flat.content[used] = content
-            flat.tau[used] = parts.tau[part]
-            flat.moment[used] = parts.moment[part]
-            flat.rays[SLACK_ROW * LANES + (content & (LANES - 1))] += buffer.part_slack[part]
-            used += 1
-    return used
+        lane = parts.content[n] & (LANES - 1)
+        length = parts.end[n] - parts.begin[n]
+        shares[SUM_ROW * LANES + lane] += parts.tau[n]
+        shares[DOUBT_ROW * LANES + lane] += pick(buffer.slack[n] > 0.0, length, 0.0)
+    for lane in range(LANES):
+        tau = sums[TAU_ROW * LANES + lane] + shares[SUM_ROW * LANES + lane]
+        give = max(allowance(error, tau, tint) - sums[SLACK_ROW * LANES + lane], 0.0)
+        begin, end = shares[BEGIN_ROW * LANES + lane], shares[END_ROW * LANES + lane]
+        far, doubt = sums[FAR_ROW * LANES + lane], shares[DOUBT_ROW * LANES + lane]
+        if end < far:
+            give *= (end - begin) / (far - begin)
+        shares[GIVE_ROW * LANES + lane] = give
+        shares[RATE_ROW * LANES + lane] = give / doubt if doubt > 0.0 else 0.0
+    for _ in range(ROUNDS):
+        share_out_again(buffer, total)
 
 
 @jit
-def bounded_segments(grid, bounds, scale, nearest, depth, tint, t, t_exit, buffer, total):
+def share_out_again(buffer, total):
+    """Raise the rates by what the parts leave over that cost no more than the rate.
+
+    (Which of them do is chance: to branch on it costs more than to add both numbers up.)
+    """
+    parts, shares = buffer.parts, buffer.shares
+    clear(shares)
+    for n in range(total):
+        lane = parts.content[n] & (LANES - 1)
+        length, slack = parts.end[n] - parts.begin[n], buffer.slack[n]
+        cheap = slack <= shares[RATE_ROW * LANES + lane] * length
+        shares[SUM_ROW * LANES + lane] += pick(cheap, slack, 0.0)
+        shares[DOUBT_ROW * LANES + lane] += pick(cheap, 0.0, length)
+    for lane in range(LANES):
+        doubt = shares[DOUBT_ROW * LANES + lane]
+        if doubt > 0.0:
+            left = shares[GIVE_ROW * LANES + lane] - shares[SUM_ROW * LANES + lane]
+            rate = shares[RATE_ROW * LANES + lane]
+            shares[RATE_ROW * LANES + lane] = max(rate, left / doubt)
+
+
+@jit
+def choose(buffer, total):
+    """List the parts that are taken by their fits, adding up their slacks, and the others, those
+    of one brick joined that meet. Returns the lengths of the lists."""
+    parts, shares, sums = buffer.parts, buffer.shares, buffer.parts.rays
+    cheap = dear = 0
+    first, met = -1, -1  # the part that others may join, and the one that would be next to do so
+    for n in range(total):
+        lane = parts.content[n] & (LANES - 1)
+        slack = buffer.slack[n]
+        settled = slack <= shares[RATE_ROW * LANES + lane] * (parts.end[n] - parts.begin[n])
+        sums[SLACK_ROW * LANES + lane] += pick(settled, slack, 0.0)
+        buffer.cheap[cheap] = n
+        cheap += int(settled)
+        if not settled:
+            joins = met == n and parts.content[first] == parts.content[n]
+            if joins and parts.end[first] == parts.begin[n]:
+                parts.end[first] = parts.end[n]
+                parts.tau[n] = parts.moment[n] = 0.0
+            else:
+                buffer.dear[dear] = n
+                dear += 1
+                first = n
+            met = n + 1
+    return cheap, dear
+
+
+@jit
+def take_fits(grid, fits, scale, depth, buffer, total):
+    """The listed parts by the fits of their regions, or exactly where they are of a constant."""
+    parts = buffer.parts
+    zero = floats(0.0)
+    for first in range(0, total, LANES):
+        here = numbers() + first < total
+        place = pick(here, load(buffer.cheap, first), 0)
+        seg = fetch_at(parts, place, here)
+        region = gather(parts.key, place, here)
+        solid = here & (region == CONSTANT)
+        octant = region - 1
+        whole = region <= 0
+        half = pick(whole, floats(4.0), 2.0)
+        x = seg.corner[0] + half + pick(whole, 0.0, to_floats((octant >> 2) & 1) * 4.0)
+        y = seg.corner[1] + half + pick(whole, 0.0, to_floats((octant >> 1) & 1) * 4.0)
+        z = seg.corner[2] + half + pick(whole, 0.0, to_floats(octant & 1) * 4.0)
+        fitted = here & ~solid
+        at = (seg.brick * REGIONS + region) * FIT
+        gx, gy = gather(fits, at + 1, fitted), gather(fits, at + 2, fitted)
+        gz = gather(fits, at + 3, fitted)
+        tm = 0.5 * (seg.begin + seg.end)
+        o, d = seg.rays.o, seg.rays.d
+        value = (
+            gather(fits, at, fitted)
+            + gx * (o[0] + tm * d[0] - x)
+            + gy * (o[1] + tm * d[1] - y)
+            + gz * (o[2] + tm * d[2] - z)
+        )
+        if any_of(solid):
+            value = pick(solid, gather(grid.constants, -1 - seg.brick, solid), value)
+        p = (value, gx * d[0] + gy * d[1] + gz * d[2], zero, zero)
+        sums = Sums(zero, floats(1.0), zero)
+        sums = add_cells(sums, p, scale, seg.begin, seg.end, here, depth, seg.t_far)
+        scatter(parts.tau, place, sums.tau, here)
+        scatter(parts.moment, place, sums.moment, here)
+
+
+@jit
+def bounded_segments(grid, bounds, scale, nearest, depth, tint, t, t_exit, segments, buffer, total):
     """The certified rule on the segments of one root cell, which rays cross from t to t_exit.
 
-    Their sums are added to those of the rays. Returns bricks, octants and cells that they are made
-    of, INTS.
+    Their sums are added to those of the rays. Returns parts and cells that they are made of, INTS.
     """
     store(buffer.shares, BEGIN_ROW * LANES, t)
     store(buffer.shares, END_ROW * LANES, t_exit)
-    survey(grid, bounds, scale, buffer, total)
-    share_out(bounds.max_error, tint, buffer, total)
-    whole, cut, dear = choose(bounds, scale, buffer, total)
-    take_whole(grid, bounds.density, scale, depth, buffer, whole)
-    settled, dear = take_octants(bounds.density, scale, depth, buffer, cut, dear)
+    first_rate(bounds.max_error, tint, buffer)
+    parts = cut(grid, bounds, scale, segments, buffer, total)
+    share_out(bounds.max_error, tint, buffer, parts)
+    cheap, dear = choose(buffer, parts)
+    take_fits(grid, bounds.density, scale, depth, buffer, cheap)
     sort_by_length(buffer.parts, dear, buffer.dear)
     cells = exact_segments(grid, scale, nearest, depth, buffer.parts, dear)
-    compose(buffer.flat, flatten(buffer, total), depth)
-    return settled + cells + pick(numbers() == 0, ints(whole), 0)
+    compose(buffer.parts, parts, depth)
+    return cells + pick(numbers() == 0, ints(cheap), 0)

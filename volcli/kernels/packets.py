@@ -111,7 +111,17 @@ def packet(
             keep_vector(buffer, CORNER_ROW, corner)
             if bounds is not None:
                 cells = bounded_segments(
-                    grid, bounds, density.scale, nearest, depth, tint, t, t_exit, more, total
+                    grid,
+                    bounds,
+                    density.scale,
+                    nearest,
+                    depth,
+                    tint,
+                    t,
+                    t_exit,
+                    buffer,
+                    more,
+                    total,
                 )
             else:
                 sort_by_length(buffer, total)
