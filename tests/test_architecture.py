@@ -24,7 +24,7 @@ LAYERS = [
     {"config", "images", "warmup", "scene"},
     {"opacity", "estimate", "reproduce", "outputs", "calibrate"},
     {"run", "describe"},
-    {"probe"},
+    {"probe", "tradeoff"},
     {"batch"},
     {"cli"},
 ]

@@ -281,7 +281,7 @@ def render_loaded(
     """The first half of `run`: the arrays of a picture, or of a part of it."""
     plan, box = prepared.plan, scene_box(loaded.scene)
     box = UNKNOWN_BOX if box is None else box
-    job = _resolved(prepared.job, make_camera(prepared.job.camera, box))
+    job = resolved(prepared.job, make_camera(prepared.job.camera, box))
     # Made anew from what was chosen, so that the job in the header gives the same rays to the bit.
     camera = make_camera(job.camera, box)
     waiting = time.perf_counter()
@@ -405,7 +405,7 @@ def _settled(job: Job, pilot: Pilot) -> Job:
     return job.model_copy(update={"quadrature": chosen})
 
 
-def _resolved(job: Job, camera: Camera) -> Job:
+def resolved(job: Job, camera: Camera) -> Job:
     """The job with what was chosen for it filled in, so that it makes the same picture anywhere."""
     chosen: dict[str, Any] = {
         "eye": tuple(camera.eye.tolist()),

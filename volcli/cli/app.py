@@ -20,6 +20,7 @@ COMMANDS = {
     "info": "List the grids of a volume.",
     "inspect": "Look at the opacity of images.",
     "probe": "Follow rays through a scene.",
+    "tradeoff": "Measure speed against accuracy.",
     "compare": "Compare two images, channel by channel.",
     "recomposite": "Put another background behind a rendered picture.",
 }

@@ -6,7 +6,14 @@ import sys
 from types import TracebackType
 from typing import Any
 
-_UNITS = {"reading": "leaves", "calibrating": "steps", "rendering": "tiles", "writing": "files"}
+_UNITS = {
+    "reading": "leaves",
+    "calibrating": "steps",
+    "rendering": "tiles",
+    "writing": "files",
+    "truth": "rows",
+    "measuring": "pictures",
+}
 _COMPILING = "compiling"
 _WAIT_SECONDS = 0.2
 """A stage that is over sooner shows no bar."""
