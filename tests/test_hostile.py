@@ -1,5 +1,6 @@
 """Files that are made to do harm: refused by name, at the byte, before anything is allocated."""
 
+import json
 import re
 import struct
 import subprocess
@@ -202,3 +203,16 @@ def test_a_malformed_file_ends_in_little_memory(path, tmp_path):
     else:
         assert code == "0", ran.stderr
         assert "is empty; it absorbs nothing" in ran.stderr
+
+
+def test_numbers_that_json_does_not_have_are_null(tmp_path):
+    path = tmp_path / "a.vdb"
+    raw, _ = written(path)
+    at = raw.index(b"UniformScaleMap") + len("UniformScaleMap")
+    struct.pack_into("<2d", raw, at, np.nan, np.inf)
+    path.write_bytes(raw)
+    ran = volcli("info", path, "--stats", "--json")
+    assert ran.code == 0, ran.err
+    (grid,) = json.loads(ran.out)["grids"]
+    assert grid["refusal"] == "transform with NaN or Inf"
+    assert grid["world_from_index"][0][0] is None

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from volcli.batch.schema import described
-from volcli.cli.table import in_bytes, say, table, terminal_width
+from volcli.cli.table import in_bytes, say, say_json, table, terminal_width
 from volcli.errors import BatchError, UsageError
 
 if TYPE_CHECKING:
@@ -187,7 +186,7 @@ def _list(expanded: Expanded, as_json: bool) -> None:
                 "state": job.state,
                 "memory_bytes": job.memory,
             }
-            say(json.dumps(row))
+            say_json(row)
         return
     rows = [
         (

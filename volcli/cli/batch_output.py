@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any
 
-from volcli.cli.table import in_bytes, say, table, terminal_width
+from volcli.cli.table import in_bytes, say, say_json, table, terminal_width
 from volcli.errors import OutputError
 
 if TYPE_CHECKING:
@@ -35,13 +35,12 @@ class Output:
         self._traced = False
         self._begun = time.monotonic()
         self._log: IO[str] | None = None
+        self._log_failed: OutputError | None = None
         if log is not None:
             try:
                 self._log = log.open("a", encoding="utf-8", buffering=1)
             except OSError as error:
-                raise OutputError(
-                    f"{log}: the log cannot be written: {error.strerror or error}"
-                ) from error
+                raise _not_logged(log, error) from error
 
     def __enter__(self) -> Output:
         return self
@@ -57,6 +56,8 @@ class Output:
             self._record(f"ended by {type(error).__name__}: {error}")
         if self._log is not None:
             self._log.close()
+        if error is None and self._log_failed is not None:
+            raise self._log_failed
 
     def note(self, text: str) -> None:
         """Say what the user should know, on stderr."""
@@ -97,7 +98,7 @@ class Output:
             self.note(warning)
         with self._beside_bar():
             if self._json:
-                say(json.dumps(_as_json(told), allow_nan=False))
+                say_json(_as_json(told))
             elif self._quiet:
                 pass  # the summary says what failed
             elif told.report is None:
@@ -131,7 +132,7 @@ class Output:
         }
         self._record(", ".join(f"{name} {value}" for name, value in numbers.items()))
         if self._json:
-            say(json.dumps({"summary": {**numbers, "manifest": str(manifest)}}))
+            say_json({"summary": {**numbers, "manifest": str(manifest)}})
             return
         rate = len(tally.done) / seconds if seconds > 0 else 0.0
         row = [str(numbers[name]) for name in ("jobs", "done", "kept", "failed", "left")]
@@ -160,8 +161,16 @@ class Output:
             say(f"\n{path}  contact sheet of {len(pictures)} pictures")
 
     def _record(self, text: str) -> None:
-        if self._log is not None:
+        if self._log is None:
+            return
+        try:
             self._log.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}\n")
+        except OSError as error:  # the pictures are worth more: they go on, and it is an error then
+            self._log_failed = _not_logged(Path(self._log.name), error)
+            with suppress(OSError):  # what could not be written is still in its buffer
+                self._log.close()
+            self._log = None
+            self.note(str(self._log_failed))
 
     def _beside_bar(self) -> Any:
         """Takes the bar off the screen while lines are printed."""
@@ -173,6 +182,10 @@ class Output:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
+
+
+def _not_logged(log: Path, error: OSError) -> OutputError:
+    return OutputError(f"{log}: the log cannot be written: {error.strerror or error}")
 
 
 def warn(text: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +10,7 @@ import typer
 
 from volcli.cli.options import background as parse_background
 from volcli.cli.options import names
-from volcli.cli.table import say, table, terminal_width
+from volcli.cli.table import say, say_json, table, terminal_width
 from volcli.errors import UsageError, VolcliError
 
 
@@ -77,7 +76,7 @@ def compare(
         write_difference(difference, pair, title, overwrite=overwrite)
         found["difference"] = str(difference)
     if as_json:
-        say(json.dumps({"a": str(a), "b": str(b), **found, "beyond": beyond}, allow_nan=False))
+        say_json({"a": str(a), "b": str(b), **found, "beyond": beyond})
     else:
         say(_summary(found))
     if beyond:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from volcli.cli.options import option
-from volcli.cli.table import in_bytes, say, table, terminal_width
+from volcli.cli.table import in_bytes, say, say_json, table, terminal_width
 
 
 def info(
@@ -34,7 +33,7 @@ def info(
     make_job({}, [("density.reader", reader)], spelled={"density.reader": f"--reader {reader}"})
     found = describe(volume, stats=stats, reader=reader)
     if as_json:
-        say(json.dumps(found, allow_nan=False))
+        say_json(found)
         return
     grids = found["grids"]
     say(f"{found['file']}  {found['format']}{'' if grids else ', holds no grids'}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from volcli.cli.table import say, table, terminal_width
+from volcli.cli.table import say, say_json, table, terminal_width
 from volcli.errors import UsageError
 from volcli.schema import MAPS
 
@@ -120,7 +119,7 @@ def inspect(
 
         write_page(html, kept, colormap=colormap, overwrite=overwrite)
     if as_json:
-        say(json.dumps(printed[0] if len(images) == 1 else {"images": printed}, allow_nan=False))
+        say_json(printed[0] if len(images) == 1 else {"images": printed})
     else:
         for written in (heatmap, html):
             if written is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from pathlib import Path
@@ -12,7 +11,7 @@ import typer
 
 from volcli.cli import scene as options
 from volcli.cli.progress import Bars
-from volcli.cli.table import say, table, terminal_width
+from volcli.cli.table import say, say_json, table, terminal_width
 from volcli.errors import UsageError
 
 _ROWS = 24
@@ -115,7 +114,7 @@ def probe(
 
         write_plot(plot, walks, found, overwrite=overwrite)
     if as_json:
-        say(json.dumps({"rays": found}, allow_nan=False))
+        say_json({"rays": found})
         return
     say("\n\n".join(_summary(one) for one in found))
     for written in (csv, plot):

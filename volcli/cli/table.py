@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import shutil
 import sys
 import unicodedata
 from collections.abc import Sequence
+from typing import Any
 
 from volcli.errors import OutputError
 
@@ -30,6 +33,19 @@ def say(text: str = "") -> None:
         os.close(nowhere)
         if not isinstance(error, BrokenPipeError):
             raise OutputError(f"stdout: cannot be written ({error.strerror})") from error
+
+
+def say_json(found: Any) -> None:
+    """Print one JSON object, with null for what is NaN or infinite, which JSON does not have."""
+    say(json.dumps(_finite(found), allow_nan=False))
+
+
+def _finite(found: Any) -> Any:
+    if isinstance(found, dict):
+        return {name: _finite(value) for name, value in found.items()}
+    if isinstance(found, list | tuple):
+        return [_finite(value) for value in found]
+    return None if isinstance(found, float) and not math.isfinite(found) else found
 
 
 def terminal_width() -> int:

@@ -25,6 +25,7 @@ Attribute = str | int | float
 _CHROMATICITIES_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _TYPES = {"float32": "float", "uint16": "uint16", "uint8": "uint8"}  # NumPy's to OpenImageIO's
 _ROWS_PER_CHECK = 256
+_ROOM = 1 << 20  # bytes: more than a writer that found no room leaves
 
 
 def write_whole(
@@ -51,6 +52,8 @@ def write_whole(
         raise OutputError(f"{path}: already exists; use --overwrite or another path") from error
     except (OSError, UnicodeError, Failed) as error:
         reason = reason_of(error).replace(str(temporary), path.name)
+        if isinstance(error, Failed):
+            reason = _refusal(temporary) or reason
         raise not_written(path, reason) from error
     finally:
         with suppress(OSError):
@@ -148,6 +151,19 @@ def _check(
                 raise Failed("read back with other pixels")
     finally:
         source.close()
+
+
+def _refusal(file: Path) -> str | None:
+    """Why the system takes no more of a file; None where it does.
+
+    OpenImageIO says of a full disk that it could not write, or what it then could not read.
+    """
+    try:
+        with file.open("ab", buffering=0) as more:
+            more.write(bytes(_ROOM))
+    except OSError as error:
+        return error.strerror
+    return None
 
 
 def _same(stored: Any, written: Attribute) -> bool:
