@@ -60,6 +60,8 @@ SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
         "midpoint 1": {"step": 1.0},
         "midpoint 0.5": {"step": 0.5},
         "midpoint 0.25": {"step": 0.25},
+        "certified 0.1": {"max_error": 0.1},
+        "certified 0.01": {"max_error": 0.01},
     },
     "vdb_render": {
         "step 1": {"step": 1.0},

@@ -22,6 +22,7 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -63,8 +64,9 @@ class Volcli:
         self.version = version("volcli")
 
     def load(self, scene: Scene) -> None:
-        """Read the .vdb file and build bricks."""
+        """Read the .vdb file, build bricks and bound them."""
         from volcli import schema
+        from volcli.bounds import scene_bounds
         from volcli.camera import make_camera
         from volcli.grids import density_grid, load_density, open_volume
         from volcli.render import Scene as Rendered
@@ -72,7 +74,8 @@ class Volcli:
         self.threads = scene["threads"]
         self.volume = open_volume(Path(scene["vdb"]))
         grid, _ = load_density(self.volume, density_grid(self.volume, None)[0], "error")
-        self.scene = Rendered(grid, scene["sigma"], (1.0, 1.0, 1.0))
+        made = Rendered(grid, scene["sigma"], (1.0, 1.0, 1.0))
+        self.scene = replace(made, bounds=scene_bounds(made, False))
         size = (scene["size"], scene["size"])
         camera = schema.Camera(
             eye=scene["eye"], target=scene["target"], fov=scene["fov"], resolution=size
@@ -80,14 +83,18 @@ class Volcli:
         self.camera = make_camera(camera, grid.world_box())
 
     def render(self, setting: Setting) -> tuple[float, Any]:
-        """``step``: None for the exact rule; ``depth``: also the hit distance."""
+        """``step`` or ``max_error``: the rule, else exact; ``depth``: also the hit distance."""
         from volcli import schema
         from volcli.plan import make_plan
         from volcli.render import render
 
         layers = {"picture", "transmittance", "optical_depth"}
-        step = setting["step"]
-        quadrature = schema.Quadrature(rule="exact" if step is None else "midpoint", step=step)
+        step = setting.get("step")
+        quadrature = schema.Quadrature(
+            rule="exact" if step is None else "midpoint",
+            step=step,
+            max_error=setting.get("max_error"),
+        )
         plan = make_plan(
             schema.Job(quadrature=quadrature),
             self.volume,
