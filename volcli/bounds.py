@@ -39,6 +39,9 @@ class SceneBounds:
         The light that errors of radiance are shares of: the largest that the scene can show. That
         is the largest magnitude of a colour, and, where there is emission, the largest magnitude of
         that along the diagonal of the box that it fills, in world units.
+    contrast
+        The difference between any two radiances that the scene can show, as a share of that at
+        most: 1, or up to 2 where some are negative.
     """
 
     density: NDArray[np.float32]
@@ -48,6 +51,7 @@ class SceneBounds:
     colour: NDArray[np.float32] | None
     emission: NDArray[np.float32] | None
     brightest: float
+    contrast: float
 
 
 BYTES_A_BRICK = 9 * 5 * 4 + 3 * 4
@@ -76,8 +80,10 @@ def scene_bounds(scene: Scene, nearest: bool, threads: int | None = None) -> Sce
             density, least, finest, boxes = density_bounds(scene.density, nearest)
         else:
             density = _transferred_bounds(scene, nearest)
-        colour, emission, brightest = _lights(scene, nearest)
-    return SceneBounds(density, least, finest, boxes, colour, emission, brightest)
+        colour, emission, (low, high) = _lights(scene, nearest)
+    brightest = max(-low, high)
+    contrast = (high - low) / brightest if brightest > 0 else 1.0
+    return SceneBounds(density, least, finest, boxes, colour, emission, brightest, contrast)
 
 
 def brightest_light(scene: Scene, nearest: bool, threads: int | None = None) -> float:
@@ -85,23 +91,27 @@ def brightest_light(scene: Scene, nearest: bool, threads: int | None = None) -> 
     if scene.bounds is not None:
         return scene.bounds.brightest
     with threads_limited_to(threads):
-        return _lights(scene, nearest)[2]
+        low, high = _lights(scene, nearest)[2]
+    return max(-low, high)
 
 
 def _lights(
     scene: Scene, nearest: bool
-) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None, float]:
-    """`SceneBounds.colour`, ``emission`` and ``brightest``."""
+) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None, tuple[float, float]]:
+    """`SceneBounds.colour` and ``emission``; the least and the largest light, 0 among it, that the
+    scene can show in any channel."""
     colour = emission = None
     if isinstance(scene.color, tuple):
-        brightest = max(abs(channel) for channel in scene.color)
+        low, high = min(0.0, *scene.color), max(0.0, *scene.color)
     else:
         colour = source_bounds(scene.color, nearest)
-        brightest = _brightest(scene.color, colour)
+        low, high = _field(scene.color, colour)
     if scene.emission is not None:
         emission = source_bounds(scene.emission, nearest)
-        brightest += _brightest(scene.emission, emission) * _diagonal(scene.emission.grid)
-    return colour, emission, brightest
+        dark, light = _field(scene.emission, emission)
+        longest = _diagonal(scene.emission.grid)
+        low, high = low + dark * longest, high + light * longest
+    return colour, emission, (low, high)
 
 
 def density_bounds(grid: BrickGrid, nearest: bool) -> tuple[Any, Any, Any, Any]:
@@ -204,11 +214,13 @@ def _value_ranges(grid: BrickGrid, nearest: bool) -> NDArray[np.float32]:
     return ranges
 
 
-def _brightest(source: Source, ranges: NDArray[np.float32]) -> float:
-    """The largest magnitude of a source: in its bricks, and where it is a constant."""
+def _field(source: Source, ranges: NDArray[np.float32]) -> tuple[float, float]:
+    """The least and the largest that a source gives, 0 among it: in bricks and in constants."""
     constants = source.grid.arrays.constants.astype(np.float64)
     colours = constants * source.scale if source.table is None else source.table.at(constants)
-    return max(float(np.abs(part).max(initial=0.0)) for part in (colours, ranges))
+    parts = (colours, ranges)
+    low = min(float(part.min(initial=0.0)) for part in parts)
+    return low, max(float(part.max(initial=0.0)) for part in parts)
 
 
 def _diagonal(grid: BrickGrid) -> float:

@@ -365,6 +365,7 @@ def _kernel_bounds(scene: Scene, plan: Plan) -> Any:
         made.emission,
         plan.max_error - 2 * PIXEL_ERROR,
         made.brightest,
+        made.contrast,
     )
 
 
@@ -382,7 +383,7 @@ def _kernel_source(
     same = np.array_equal(density.world_from_index, grid.world_from_index)
     return KernelSource(
         grid.arrays,
-        None if table is None else Table(table.knots, table.colors, table.kinks),
+        None if table is None else Table(table.knots, table.colors, table.kinks, table.bends),
         source.scale if table is None else None,
         grid.local_from_world,
         grid.support(interpolation),

@@ -60,6 +60,14 @@ class ColorTable:
         off = np.vstack([ends[:1], np.abs(self.colors[1:-1] - line), ends[1:]]).max(axis=1)
         return self.knots[off > KINK * np.abs(self.colors).max()]
 
+    @property
+    def bends(self) -> NDArray[np.float64]:
+        """(k + 1,): how much the slope has changed before the first knot (0) and behind each; see
+        `kernels.source.Table`."""
+        slopes = np.diff(self.colors, axis=0) / np.diff(self.knots)[:, None]
+        changes = np.abs(np.diff(slopes, axis=0, prepend=np.zeros((1, 3)), append=np.zeros((1, 3))))
+        return np.concatenate([[0.0], np.cumsum(changes.max(axis=1))])
+
     def at(self, values: ArrayLike) -> NDArray[np.float64]:
         """(...) values to (..., 3) colours."""
         at = np.asarray(values, np.float64)

@@ -57,6 +57,9 @@ class Bounds(NamedTuple):
         The error of transmittance, and of radiance as a share of ``brightest``, that is allowed.
     brightest
         The light that errors of radiance are measured by: the largest that the scene can show.
+    contrast
+        The difference between any two radiances that the scene can show, as a share of that at
+        most: 1, or up to 2 where some are negative.
     """
 
     density: NDArray[np.float32]
@@ -67,6 +70,7 @@ class Bounds(NamedTuple):
     emission: NDArray[np.float32] | None
     max_error: float
     brightest: float
+    contrast: float
 
 
 @jit

@@ -15,8 +15,8 @@ compiles a version without it.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
+from volcli.kernels.bounded_light import add_bounded_span
 from volcli.kernels.cell import (
     MAX_TAU,
     SHORTEST,
@@ -27,6 +27,7 @@ from volcli.kernels.cell import (
 )
 from volcli.kernels.compiler import jit
 from volcli.kernels.source import kink_exit, source_at, source_cell
+from volcli.kernels.state import State, darken, strongest, weakest
 
 OUTER_SHARE, INNER_SHARE = WEIGHT / (2.0 + 2.0 * WEIGHT), 1.0 / (2.0 + 2.0 * WEIGHT)
 """The shares of the nodes of Gauss' rule."""
@@ -36,32 +37,6 @@ FADED = 2.0**-24
 
 STOP_TAU = -math.log(FADED)
 """The optical depth beyond which T < FADED."""
-
-
-class State(NamedTuple):
-    """What is known of a ray up to some distance.
-
-    Attributes
-    ----------
-    tau
-        Optical depth.
-    T
-        Transmittance, exp(-tau): kept up within a brick, taken afresh from tau at the next.
-    r, g, b
-        Radiance.
-    moment
-        The integral of t T sigma dt, for the expected hit distance.
-    t_far
-        Where the ray leaves the volume: no hit is farther.
-    """
-
-    tau: float
-    T: float
-    r: float
-    g: float
-    b: float
-    moment: float
-    t_far: float
 
 
 @jit
@@ -116,30 +91,18 @@ def seen_emission(
 
 
 @jit
-def add_span(
-    state,
-    p,
-    scale,
-    tm,
-    t0,
-    t1,
-    colour,
-    emission,
-    tint,
-    nearest,
-    depth,
-    cell,
-    ray,
-    emission_cell,
-    emission_ray,
-):
-    """Add the light of [t0, t1] to the state.
+def add_span(state, span, colour, emission, tint, nearest, depth, colour_at, emission_at):
+    """Add the light of a span to the state.
 
-    ``p`` is the density's cubic about the distance ``tm``; ``cell`` is the colour's, and ``ray`` is
-    in voxels of the colour grid; and so for emission. A span of optical depth above `MAX_TAU` is
+    ``span`` is (p, scale, tm, t0, t1): over [t0, t1], density is the cubic ``p`` about the distance
+    ``tm``. ``colour_at`` is the cell of the colour, and the ray in its voxels; and so for emission.
+    A span of optical depth above `MAX_TAU` is
     added in parts, each half or twice as long as the one before, or the same, so that none is
     above.
     """
+    p, scale, tm, t0, t1 = span
+    cell, ray = colour_at
+    emission_cell, emission_ray = emission_at
     u, end = t0 - tm, t1 - tm
     begin = antiderivative(p, u)
     whole = max(0.0, scale * (antiderivative(p, end) - begin))
@@ -154,7 +117,7 @@ def add_span(
         if thickest * (antiderivative(p, to) - begin) > MAX_TAU and length > shortest:
             length *= 0.5
             continue
-        tau, T, r, g, b, moment, t_far = state
+        tau, T, r, g, b, moment, t_far, error = state
         part, at, w = hit_weights(p, scale, u, to)
         hit = T * absorbed(part)
         if colour is not None:
@@ -197,13 +160,14 @@ def add_span(
         if depth is not None:
             mean = at[0] * w[0] + at[1] * w[1] + at[2] * w[2] + at[3] * w[3]
             moment += hit * (tm + mean)
-        state = State(tau + part, T - hit, r, g, b, moment, t_far)
+        state = State(tau + part, T - hit, r, g, b, moment, t_far, error)
         if faded(state, colour, emission, tint, depth):
             break
         u = to
         begin = antiderivative(p, u)
         length *= 2.0
-    return State(final, state.T, state.r, state.g, state.b, state.moment, state.t_far)
+    _, T, r, g, b, moment, t_far, error = state
+    return State(final, T, r, g, b, moment, t_far, error)
 
 
 @jit
@@ -218,6 +182,7 @@ def add_spans(
     emission,
     tint,
     nearest,
+    bounds,
     depth,
     own,
     path,
@@ -226,12 +191,13 @@ def add_spans(
 ):
     """As `add_span`, cut where the ray crosses the planes of a source's own lattice.
 
-    ``own`` and ``emission_own`` are as in `source_cell`.
+    ``own`` and ``emission_own`` are as in `source_cell`. With ``bounds`` the error of the span is
+    added up as well, and kept to what they allow.
     """
     t = t0
     cell = emission_cell = (0, 0, 0, 0)
     while t < t1:
-        if faded(state, colour, emission, tint, depth):
+        if bounds is None and faded(state, colour, emission, tint, depth):
             rest = antiderivative(p, t1 - tm) - antiderivative(p, t - tm)
             return darken(state, max(0.0, scale * rest))
         t_exit = t1
@@ -243,31 +209,18 @@ def add_spans(
             t_exit = kink_exit(
                 emission.grid, emission.table, nearest, emission_cell, emission_path.ray, t, t_exit
             )
-        state = add_span(
-            state,
-            p,
-            scale,
-            tm,
-            t,
-            t_exit,
-            colour,
-            emission,
-            tint,
-            nearest,
-            depth,
-            cell,
-            path.ray,
-            emission_cell,
-            emission_path.ray,
-        )
+        span = (p, scale, tm, t, t_exit)
+        colour_at, emission_at = (cell, path.ray), (emission_cell, emission_path.ray)
+        if bounds is not None:
+            state = add_bounded_span(
+                state, span, colour, emission, tint, nearest, bounds, depth, colour_at, emission_at
+            )
+        else:
+            state = add_span(
+                state, span, colour, emission, tint, nearest, depth, colour_at, emission_at
+            )
         t = t_exit
     return state
-
-
-@jit
-def strongest(tint):
-    """The largest factor of the extinction that any sum of the ray's uses."""
-    return 1.0 if tint is None else max(1.0, max(tint[0], max(tint[1], tint[2])))
 
 
 @jit
@@ -277,36 +230,12 @@ def faded(state, colour, emission, tint, depth):
 
     T alone does not tell: what is behind may be brighter than what is in front.
     """
-    weakest = 1.0 if tint is None else min(1.0, min(tint[0], min(tint[1], tint[2])))
-    if weakest * state.tau <= STOP_TAU:
+    if weakest(tint) * state.tau <= STOP_TAU:
         return False
-    T = math.exp(-weakest * state.tau)
+    T = math.exp(-weakest(tint) * state.tau)
     seen = max(abs(state.r), max(abs(state.g), abs(state.b)))
     if colour is not None and T * colour.brightest > FADED * seen:
         return False
     if emission is not None and T * emission.brightest * state.t_far > FADED * seen:
         return False
     return depth is None or T * state.t_far <= FADED * state.moment
-
-
-@jit
-def darken(state, tau):
-    """The state after an optical depth of tau whose light is not asked for, or too weak to count.
-
-    T is left behind: it is taken afresh from tau before it is used again.
-    """
-    return State(state.tau + tau, state.T, state.r, state.g, state.b, state.moment, state.t_far)
-
-
-@jit
-def refresh(state):
-    """The state with T taken from tau, so that no product of many factors builds up."""
-    return State(
-        state.tau,
-        math.exp(-state.tau),
-        state.r,
-        state.g,
-        state.b,
-        state.moment,
-        state.t_far,
-    )

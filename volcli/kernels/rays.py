@@ -5,7 +5,7 @@ caller shares batches out among threads. A ray's result depends on nothing but t
 are the same bit by bit for any number of threads.
 
 A term that a scene does not use is None (``transfer``, ``colour``, ``emission``, ``tint``,
-``depth``, ``step``, ``nearest``): numba compiles a version of the loop without it.
+``depth``, ``step``, ``nearest``, ``bounds``): numba compiles a version of the loop without it.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from volcli.kernels.bounded import bounded_segment, spend_rest
 from volcli.kernels.compiler import jit, kernel
-from volcli.kernels.light import State, refresh
 from volcli.kernels.rules import exact_segment, midpoint_segment
 from volcli.kernels.source import NOWHERE, Path
+from volcli.kernels.state import State, refresh
 from volcli.kernels.traversal import (
     clip,
     enter,
@@ -99,6 +100,7 @@ def path_of(source, origins, directions, n, t_start, shift, everywhere):
 @jit
 def add_segment(
     state,
+    faded,
     density,
     entry,
     corner,
@@ -113,14 +115,35 @@ def add_segment(
     emission,
     tint,
     nearest,
+    bounds,
     depth,
     path,
     emission_path,
 ):
     """Add one segment by the rule that was asked for: (state, evaluated)."""
     grid, scale = density.grid, density.scale
-    if colour is not None or emission is not None or depth is not None:
+    if colour is not None or emission is not None or depth is not None or bounds is not None:
         state = refresh(state)
+    if bounds is not None:
+        return bounded_segment(
+            state,
+            faded,
+            density,
+            entry,
+            corner,
+            ray,
+            t0,
+            t1,
+            transfer,
+            colour,
+            emission,
+            tint,
+            nearest,
+            bounds,
+            depth,
+            path,
+            emission_path,
+        )
     if step_voxels is not None:
         return midpoint_segment(
             state,
@@ -156,6 +179,7 @@ def add_segment(
         emission,
         tint,
         nearest,
+        bounds,
         depth,
         path,
         emission_path,
@@ -200,9 +224,15 @@ def integrate_rays(
         Length of a step of the midpoint rule, in voxels; None: the exact rule.
     nearest
         True for nearest-voxel interpolation of all grids, None for trilinear.
+    bounds
+        `bounds.Bounds`: what may be used in place of cells, and the error that this may make; None
+        for a rule that certifies nothing.
     depth
         (n,) float64, written: the expected distance to a hit, +inf where nothing can be hit; or
         None. A tint has no part in it.
+    error
+        (n,) float64, written with bounds: what transmittance (of any channel), and radiance as a
+        share of the brightest, is off by at most, but for rounding; else None.
     optical_depth
         (n,) float64, written: without the tint.
     radiance
@@ -212,7 +242,7 @@ def integrate_rays(
 
     Returns
     -------
-    Cells (or samples, for the midpoint rule) evaluated.
+    Cells (or samples, for the midpoint rule) evaluated; a part taken as a whole counts as one.
     """
     grid = density.grid
     # With nearest, voxel (i, j, k) is the unit cube around its lattice point: half a voxel's
@@ -229,7 +259,8 @@ def integrate_rays(
             to = to_local(emission.local_from_world, directions, n, 0.0)
             emission_begin, emission_end = clip_to(emission.support, o, to)
             t_near, t_far = min(t_near, emission_begin), max(t_far, emission_end)
-        state = State(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, t_far - t_near)
+        state = State(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, t_far - t_near, 0.0)
+        faded = False
         if t_near < t_far:
             t_far -= t_near
             begin = min(begin - t_near, t_far)
@@ -265,8 +296,11 @@ def integrate_rays(
                         put(buffer, t, t_far, NOWHERE, 0, 0, 0)
                     t = t_far
                 for s in range(buffer.used[0]):
+                    if bounds is not None:
+                        state, faded = spend_rest(state, faded, tint, bounds)
                     state, cells = add_segment(
                         state,
+                        faded,
                         density,
                         int(buffer.entries[s]),
                         (buffer.corners[s, 0], buffer.corners[s, 1], buffer.corners[s, 2]),
@@ -281,6 +315,7 @@ def integrate_rays(
                         emission,
                         tint,
                         nearest,
+                        bounds,
                         depth,
                         path,
                         emission_path,
@@ -292,6 +327,8 @@ def integrate_rays(
             radiance[n, 0] = state.r
             radiance[n, 1] = state.g
             radiance[n, 2] = state.b
+        if error is not None:
+            error[n] = state.error
         if depth is not None:
             hit = -math.expm1(-state.tau)
             depth[n] = t_near + state.moment / hit if hit > 0.0 else math.inf

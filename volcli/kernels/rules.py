@@ -12,8 +12,9 @@ import numpy as np
 
 from volcli.kernels.cell import absorbed, antiderivative, cubic, integral, load, trilinear
 from volcli.kernels.compiler import jit
-from volcli.kernels.light import State, add_spans, darken, faded
+from volcli.kernels.light import add_spans, faded
 from volcli.kernels.source import NOWHERE, WALK, source_at, source_cell
+from volcli.kernels.state import State, darken
 from volcli.kernels.transfer import linear_piece, transferred
 from volcli.kernels.traversal import advance, brick_entry, start_all
 
@@ -46,13 +47,14 @@ def exact_segment(
     emission,
     tint,
     nearest,
+    bounds,
     depth,
     path,
     emission_path,
 ):
     """Walk a segment cell by cell; optical depth is exact in each. A constant is one cell.
 
-    With ``nearest`` a cell has one value.
+    With ``nearest`` a cell has one value. With ``bounds`` the error of its light is added up.
     """
     x, y, z = corner
     i, j, k, tx, ty, tz, sx, sy, sz, ddx, ddy, ddz = start_all(ray, t0, x, y, z, 1.0, 8.0)
@@ -61,7 +63,7 @@ def exact_segment(
         i, j, k, tx, ty, tz = 0, 0, 0, math.inf, math.inf, math.inf
     lit = False
     if colour is not None or emission is not None or depth is not None:
-        lit = not faded(state, colour, emission, tint, depth)
+        lit = bounds is not None or not faded(state, colour, emission, tint, depth)
     own, cx, cy, cz = own_cell(colour, entry, x, y, z)
     emission_own, ex, ey, ez = own_cell(emission, entry, x, y, z)
     cells = 0
@@ -96,6 +98,7 @@ def exact_segment(
                     emission,
                     tint,
                     nearest,
+                    bounds,
                     depth,
                     lit,
                     (own, cx + i, cy + j, cz + k),
@@ -132,6 +135,7 @@ def add_cell(
     emission,
     tint,
     nearest,
+    bounds,
     depth,
     lit,
     own,
@@ -165,6 +169,7 @@ def add_cell(
                 emission,
                 tint,
                 nearest,
+                bounds,
                 depth,
                 own,
                 path,
@@ -241,7 +246,7 @@ def midpoint_segment(
             state = darken(state, tau)
             continue
         hit = state.T * absorbed(tau)
-        _, T, r, g, b, moment, _ = state
+        _, T, r, g, b, moment, _, error = state
         if colour is not None and hit > 0.0:
             cell = source_cell(colour, WALK, path, t, t_far)[1]
             cr, cg, cb = source_at(colour, nearest, cell, path.ray, t)
@@ -258,7 +263,7 @@ def midpoint_segment(
             b += length * lb * eb
         if depth is not None:
             moment += hit * t
-        state = State(state.tau + tau, T - hit, r, g, b, moment, t_far)
+        state = State(state.tau + tau, T - hit, r, g, b, moment, t_far, error)
     return state, samples
 
 

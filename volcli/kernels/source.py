@@ -36,11 +36,15 @@ class Table(NamedTuple):
     kinks
         (m,) float64, ascending: values at which the colour turns sharply. Gauss' rule is off across
         them, so spans end there.
+    bends
+        (k + 1,) float64: 0, then how much the slope has changed up to each knot, that one included,
+        all changes counted as positive and each that of the channel where it is largest.
     """
 
     knots: NDArray[np.float64]
     colours: NDArray[np.float64]
     kinks: NDArray[np.float64]
+    bends: NDArray[np.float64]
 
 
 class Source(NamedTuple):
@@ -220,7 +224,13 @@ def table_colour(table, value):
 @jit
 def channel(atlas, brick, b, c, x, y, z):
     """Channel c at (x, y, z) in the cell of a brick whose first corner is value b."""
-    v = (
+    return trilinear(channel_values(atlas, brick, b, c), x, y, z)
+
+
+@jit
+def channel_values(atlas, brick, b, c):
+    """The corners of the cell of a brick whose first is value b, of channel c."""
+    return (
         np.float64(atlas[brick, b, c]),
         np.float64(atlas[brick, b + 1, c]),
         np.float64(atlas[brick, b + 9, c]),
@@ -230,7 +240,6 @@ def channel(atlas, brick, b, c, x, y, z):
         np.float64(atlas[brick, b + 90, c]),
         np.float64(atlas[brick, b + 91, c]),
     )
-    return trilinear(v, x, y, z)
 
 
 @jit
