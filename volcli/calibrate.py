@@ -22,9 +22,9 @@ from volcli.render import Scene
 from volcli.scene import scene_box
 from volcli.trace import Floats, RayResult, errors, trace
 
-STEPS = (8.0, 5.6, 4.0, 2.8, 2.0, 1.4, 1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.125)
-"""Voxels: the steps that are tried, each about 1 / sqrt(2) of the one before. Where they divide a
-voxel the error is often smaller than at a shorter step that does not."""
+STEPS = (8.0, 5.6, 4.0, 2.8, 2.0, 1.4, 1.2, 1.0, 0.5, 0.333, 0.25, 0.2, 0.167, 0.125)
+"""Voxels: the steps that are tried. From 1 down they are parts of a voxel, whose error is often
+half of that of others and less: in samples/cloud.vdb that of 0.7 is above that of 1."""
 
 RAYS = 8192
 """Of a pilot. Were 1 pixel in 1000 above the target, 8 of them would be on average, and only

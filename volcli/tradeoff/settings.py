@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from volcli.plan import Plan
 from volcli.schema import Quadrature
 
-STEPS = (8.0, 4.0, 2.8, 2.0, 1.4, 1.0, 0.7, 0.5, 0.25, 0.125)
+STEPS = (8.0, 4.0, 2.8, 2.0, 1.4, 1.0, 0.7, 0.5, 0.333, 0.25, 0.125)
 """Voxels: of the midpoint rule, closest where most people choose."""
 
 MAX_ERRORS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
