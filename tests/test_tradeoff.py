@@ -10,14 +10,24 @@ import pytest
 import reference
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import Medium, View, plan_for, random_colours, random_values, tree_of, truth
+from scenes import (
+    IDENTITY,
+    Medium,
+    View,
+    affine,
+    plan_for,
+    random_colours,
+    random_values,
+    rotation,
+    tree_of,
+    truth,
+)
 
-from volcli.bounds import brightest_light
 from volcli.render import PIXEL_ERROR, Scene, Source, render
 from volcli.schema import Quadrature
 from volcli.tradeoff import measure as measuring
 from volcli.tradeoff.advice import advise, cheapest, front, observed_order
-from volcli.tradeoff.measure import Errors, Measured, Refused, measure
+from volcli.tradeoff.measure import Errors, Measured, Refused, measure, with_bounds
 from volcli.tradeoff.report import COLUMNS, Tradeoff, as_csv, as_data, reasons, rows
 from volcli.tradeoff.settings import MAX_ERRORS, STEPS, Setting, settings
 from volcli.tradeoff.truth import true_picture
@@ -84,14 +94,14 @@ def test_the_plan_of_a_setting_has_its_rule_and_no_other():
 
 
 def scene_of(density, scale, color=(1.0, 0.5, 0.25), tint=None):
-    return Scene(density.grid, scale, color, tint=tint)
+    return with_bounds(Scene(density.grid, scale, color, tint=tint), plan_for())[0]
 
 
 @pytest.mark.parametrize("scale", [0.05, 1.0, 30.0])
 def test_the_truth_agrees_with_an_independent_one(scale):
     density = Medium(tree_of_values(3))
     scene = scene_of(density, scale)
-    found = true_picture(scene, plan_for(), VIEW.camera, brightest_light(scene, False), 1)
+    found = true_picture(scene, plan_for(), VIEW.camera, 1)
     tau, _, _ = truth(density, VIEW, scale)
     np.testing.assert_allclose(found.transmittance[..., 0], np.exp(-tau), atol=1e-9)
     light = -np.expm1(-tau)[..., None] * np.array(scene.color)
@@ -102,18 +112,32 @@ def test_the_truth_agrees_with_an_independent_one(scale):
 def test_the_truth_of_a_tint_is_by_channel():
     density, tint = Medium(tree_of_values(4)), (1.0, 0.5, 0.1)
     scene = scene_of(density, 0.7, tint=tint)
-    found = true_picture(scene, plan_for(), VIEW.camera, 1.0, 1)
+    found = true_picture(scene, plan_for(), VIEW.camera, 1)
     tau, _, _ = truth(density, VIEW, 0.7)
     through = np.exp(-tau[..., None] * np.array(tint))
     np.testing.assert_allclose(found.transmittance, through, atol=1e-9)
     np.testing.assert_allclose(found.radiance, (1 - through) * np.array(scene.color), atol=1e-9)
 
 
+@pytest.mark.parametrize("scale", [0.05, 1.0, 30.0])
+@pytest.mark.parametrize("same_lattice", [True, False])
+def test_the_truth_of_light_that_varies_agrees_with_an_independent_one(scale, same_lattice):
+    density = Medium(tree_of_values(3))
+    lattice = affine(0.7 * rotation((1, 2, 3), 20.0), (0.3, -0.2, 0.4))
+    colour = Medium(tree_of_values(5, colour=True), IDENTITY if same_lattice else lattice)
+    scene = scene_of(density, scale, Source(colour.grid))
+    found = true_picture(scene, plan_for(), VIEW.camera, 1)
+    assert 0 < found.error_bound <= 1e-10
+    tau, light, _ = truth(density, VIEW, scale, colour)
+    np.testing.assert_allclose(found.transmittance[..., 0], np.exp(-tau), atol=1e-9)
+    np.testing.assert_allclose(found.radiance, light, atol=1e-9)
+
+
 def test_the_truth_of_a_pixel_is_the_mean_of_its_samples():
     density = Medium(tree_of_values(5))
     samples = np.array([[0.25, 0.25], [0.75, 0.5], [0.5, 0.75]])
     camera = replace(VIEW.camera, samples=samples)
-    found = true_picture(scene_of(density, 1.0), plan_for(), camera, 1.0, 1)
+    found = true_picture(scene_of(density, 1.0), plan_for(), camera, 1)
     lattice = density.lattice()
     means = []
     for one in samples:
@@ -125,11 +149,11 @@ def test_the_truth_of_a_pixel_is_the_mean_of_its_samples():
 
 def test_a_picture_taken_in_bands_is_that_taken_at_once(monkeypatch):
     scene = scene_of(Medium(tree_of_values(6)), 1.0)
-    whole = true_picture(scene, plan_for(), VIEW.camera, 1.0, 1)
+    whole = true_picture(scene, plan_for(), VIEW.camera, 1)
     monkeypatch.setattr("volcli.tradeoff.truth._RAYS", 15)
     seen = []
     bands = true_picture(
-        scene, plan_for(), VIEW.camera, 1.0, 1, lambda done, total: seen.append((done, total))
+        scene, plan_for(), VIEW.camera, 1, lambda done, total: seen.append((done, total))
     )
     np.testing.assert_array_equal(whole.transmittance, bands.transmittance)
     assert seen == [(0, 5), (2, 5), (4, 5), (5, 5)]
@@ -138,11 +162,11 @@ def test_a_picture_taken_in_bands_is_that_taken_at_once(monkeypatch):
 def test_errors_are_of_transmittance_and_of_light_as_a_share_of_the_brightest():
     density = Medium(tree_of_values(7))
     colour = Medium(tree_of_values(8, colour=True))
-    scene = Scene(density.grid, 0.6, Source(colour.grid, scale=5.0))
-    brightest = brightest_light(scene, False)
+    scene = scene_of(density, 0.6, Source(colour.grid, scale=5.0))
+    exact = true_picture(scene, plan_for(), VIEW.camera, 1)
+    brightest = exact.brightest
     # What is largest of all that is stored, times 5.
     assert brightest == pytest.approx(5 * colour.tree.leaf_values.max(), rel=1e-6)
-    exact = true_picture(scene, plan_for(), VIEW.camera, brightest, 1)
     result = render(scene, plan_for(step=1.3), VIEW.camera, threads=1)
     off = exact.errors(result)
     through = np.abs(result.transmittance - exact.transmittance[..., 0])
@@ -164,7 +188,7 @@ def tree_of_values(seed, colour=False):
 def measured():
     scene = scene_of(Medium(tree_of_values(9)), 0.8)
     plan, camera = plan_for(), VIEW.camera
-    exact = true_picture(scene, plan, camera, 1.0, 1)
+    exact = true_picture(scene, plan, camera, 1)
     chosen = [
         Setting(Quadrature()),
         Setting(midpoint(1.0)),
@@ -172,9 +196,7 @@ def measured():
         Setting(midpoint(1e-9)),
     ]
     told = []
-    found = measure(
-        scene, plan, camera, exact, chosen, 5, 1, lambda done, total: told.append((done, total))
-    )
+    found = measure(scene, plan, camera, exact, chosen, 5, 0.25, 1, lambda *at: told.append(at))
     return scene, exact, found, told
 
 
@@ -184,8 +206,8 @@ def test_each_setting_is_timed_in_every_round(measured):
         assert len(one.seconds) == 5
         assert min(one.seconds) <= one.median <= max(one.seconds)
         assert one.compile_seconds >= 0
-    assert found[2].setup_seconds > 0
-    assert min(found[2].seconds) > found[2].setup_seconds, "what it takes beforehand is counted"
+    assert [one.setup_seconds for one in found[:3]] == [0, 0, 0.25]
+    assert min(found[2].seconds) > 0.25, "what it takes beforehand is counted"
     assert told == [(n, 24) for n in range(1, 25)]
 
 
@@ -217,7 +239,7 @@ def test_rounds_take_turns(monkeypatch):
     order = []
 
     scene = scene_of(Medium(tree_of_values(9)), 0.8)
-    exact = true_picture(scene, plan_for(), VIEW.camera, 1.0, 1)
+    exact = true_picture(scene, plan_for(), VIEW.camera, 1)
 
     def counted(scene, plan, camera, threads=None):
         order.append(plan.rule)
@@ -225,7 +247,7 @@ def test_rounds_take_turns(monkeypatch):
 
     monkeypatch.setattr(measuring, "render", counted)
     chosen = [Setting(Quadrature()), Setting(midpoint(1.0)), Setting(midpoint(2.0))]
-    measure(scene, plan_for(), VIEW.camera, exact, chosen, 5, 1)
+    measure(scene, plan_for(), VIEW.camera, exact, chosen, 5, 0.0, 1)
     assert len(order) == 3 * 6
     for first in range(0, 18, 3):
         assert set(order[first : first + 3]) == {"exact", "midpoint 1", "midpoint 2"}
@@ -334,7 +356,7 @@ def test_the_order_of_midpoint_is_2_on_a_smooth_volume():
     density = Medium(tree_of(np.clip(1 - r2, 0, None)))
     view = View((90.0, 70.0, 130.0), (31.5, 31.5, 31.5), fov=30.0, resolution=(100, 75))
     scene = scene_of(density, 0.2)
-    exact = true_picture(scene, plan_for(), view.camera, 1.0)
+    exact = true_picture(scene, plan_for(), view.camera)
     chosen = [Setting(midpoint(step)) for step in STEPS]
     found = measure(scene, plan_for(), view.camera, exact, chosen, 1)
     order = observed_order(found)
@@ -354,6 +376,7 @@ def example():
         1,
         5,
         2,
+        0.0,
         (
             row(1.0, 3e-8),
             row(0.2, 1e-2, midpoint(2.0), own=True),

@@ -90,51 +90,8 @@ class Refused:
     reason: str
 
 
-def measure(
-    scene: Scene,
-    plan: Plan,
-    camera: Camera,
-    truth: Truth,
-    chosen: Sequence[Setting],
-    rounds: int,
-    threads: int | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Measured | Refused]:
-    """Measure settings.
-
-    Parameters
-    ----------
-    plan
-        Of any rule.
-    progress
-        Called with pictures done and pictures in all.
-
-    Returns
-    -------
-    One for each setting, in their order.
-    """
-    bounded, setup = _with_bounds(scene, plan, threads)
-    total, done = len(chosen) * (rounds + 1), 0
-    found: dict[str, Measured | Refused] = {}
-    for setting in chosen:
-        found[setting.name] = _first(setting, bounded, plan, camera, truth, threads)
-        done += 1
-        progress(done, total)
-    for number in range(rounds):
-        for setting in chosen if number % 2 else chosen[::-1]:
-            done += 1
-            before = found[setting.name]
-            if isinstance(before, Measured):
-                extra = setup if setting.family == "certified" else 0.0
-                result = render(bounded, setting.plan(plan), camera, threads=threads)
-                seconds = (*before.seconds, extra + result.render_seconds)
-                found[setting.name] = replace(before, seconds=seconds, setup_seconds=extra)
-            progress(done, total)
-    return [found[setting.name] for setting in chosen]
-
-
-def _with_bounds(scene: Scene, plan: Plan, threads: int | None) -> tuple[Scene, float]:
-    """The scene with what the certified rule needs, and how long that takes."""
+def with_bounds(scene: Scene, plan: Plan, threads: int | None = None) -> tuple[Scene, float]:
+    """The scene with its bounds, which the certified rule needs, and how long those take."""
     bounds = scene_bounds(scene, plan.nearest, threads)  # compiles
     times = []
     for _ in range(3):
@@ -142,6 +99,53 @@ def _with_bounds(scene: Scene, plan: Plan, threads: int | None) -> tuple[Scene, 
         scene_bounds(scene, plan.nearest, threads)
         times.append(time.perf_counter() - begin)
     return replace(scene, bounds=bounds), statistics.median(times)
+
+
+def measure(
+    scene: Scene,
+    plan: Plan,
+    camera: Camera,
+    truth: Truth,
+    chosen: Sequence[Setting],
+    rounds: int,
+    setup_seconds: float = 0.0,
+    threads: int | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Measured | Refused]:
+    """Measure settings.
+
+    Parameters
+    ----------
+    scene
+        With its bounds.
+    plan
+        Of any rule.
+    setup_seconds
+        What those took: part of the time of the certified rule.
+    progress
+        Called with pictures done and pictures in all.
+
+    Returns
+    -------
+    One for each setting, in their order.
+    """
+    total, done = len(chosen) * (rounds + 1), 0
+    found: dict[str, Measured | Refused] = {}
+    for setting in chosen:
+        found[setting.name] = _first(setting, scene, plan, camera, truth, threads)
+        done += 1
+        progress(done, total)
+    for number in range(rounds):
+        for setting in chosen if number % 2 else chosen[::-1]:
+            done += 1
+            before = found[setting.name]
+            if isinstance(before, Measured):
+                extra = setup_seconds if setting.family == "certified" else 0.0
+                result = render(scene, setting.plan(plan), camera, threads=threads)
+                seconds = (*before.seconds, extra + result.render_seconds)
+                found[setting.name] = replace(before, seconds=seconds, setup_seconds=extra)
+            progress(done, total)
+    return [found[setting.name] for setting in chosen]
 
 
 def _first(

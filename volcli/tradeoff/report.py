@@ -50,6 +50,8 @@ class Tradeoff:
         Rays a pixel.
     rounds, threads
         How often, and with how many threads, each setting was timed.
+    truth_error
+        What the truth is off by at most.
     rows
         The settings, from exact to the finest error.
     warnings
@@ -62,6 +64,7 @@ class Tradeoff:
     samples: int
     rounds: int
     threads: int
+    truth_error: float
     rows: tuple[Measured | Refused, ...]
     warnings: tuple[str, ...]
 
@@ -97,6 +100,7 @@ def as_data(found: Tradeoff) -> dict[str, Any]:
         "samples": found.samples,
         "rounds": found.rounds,
         "threads": found.threads,
+        "truth_error": found.truth_error,
         "settings": [_row(row, best) for row in found.rows],
         "front": [row.setting.name for row in found.front],
         "own": None if found.own is None else found.own.setting.name,

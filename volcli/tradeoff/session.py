@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from volcli.bounds import brightest_light
 from volcli.calibrate import calibrate
 from volcli.camera import Camera, make_camera
 from volcli.config import job_as_toml
@@ -23,7 +22,7 @@ from volcli.run import UNKNOWN_BOX, OnStage, load, prepare, resolved
 from volcli.scene import scene_box
 from volcli.schema import Job, Quadrature
 from volcli.tradeoff.advice import advise
-from volcli.tradeoff.measure import Measured, measure
+from volcli.tradeoff.measure import Measured, measure, with_bounds
 from volcli.tradeoff.plot import write_plot
 from volcli.tradeoff.report import Tradeoff, as_csv, as_data
 from volcli.tradeoff.settings import settings
@@ -106,11 +105,11 @@ def measure_job(
     camera = _smaller(full) if wanted.quick else full
     own = job.quadrature if job.quadrature.model_fields_set else None
     mine = None if own is None else _settled(own, scene, plan, full, threads)
+    scene, setup_seconds = with_bounds(scene, plan, threads)
     truth = true_picture(
         scene,
         plan,
         camera,
-        brightest_light(scene, plan.nearest, threads),
         threads,
         lambda done, total: on_stage("truth", done, total),
     )
@@ -121,6 +120,7 @@ def measure_job(
         truth,
         settings(mine),
         rounds,
+        setup_seconds,
         threads,
         lambda done, total: on_stage("measuring", done, total),
     )
@@ -132,6 +132,7 @@ def measure_job(
         samples=len(camera.samples),
         rounds=rounds,
         threads=threads or available_threads(),
+        truth_error=truth.error_bound,
         rows=tuple(row.scaled(factor) if isinstance(row, Measured) else row for row in rows),
         warnings=(*plan.warnings, *loaded.warnings),
     )
