@@ -36,6 +36,7 @@ bench: $(SETUP)
 	$(BIN)/python -m benchmarks.render
 	$(BIN)/python -m benchmarks.peers
 	$(BIN)/python -m benchmarks.scaling
+	$(BIN)/python -m benchmarks.memory
 	$(BIN)/python -m benchmarks.batch
 	$(BIN)/python -m benchmarks.report
 

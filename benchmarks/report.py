@@ -189,6 +189,16 @@ def scaling(results: dict[str, Any]) -> str:
     )
 
 
+def memory(results: dict[str, Any]) -> str:
+    """What renders were said to take, and took."""
+    rows = [["active voxels", "`--explain` says", "peak", "of what it said"]]
+    for row in results["volumes"]:
+        said, peak = row["estimate_bytes"] / 1e6, row["peak_bytes"] / 1e6
+        share = f"{row['peak_over_estimate']:.2f}"
+        rows.append([f"{row['active_voxels']:,}", f"{said:.0f} MB", f"{peak:.0f} MB", share])
+    return _markdown(rows)
+
+
 def batch(results: dict[str, Any]) -> str:
     """A batch beside a shell loop, and after it was killed."""
     mixed, killed = results["mixed"], results["killed"]
@@ -222,7 +232,7 @@ def _markdown(rows: list[list[str]]) -> str:
     return "\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]])
 
 
-BLOCKS = (accuracy, peers, render, process, load, load_large, startup, scaling, batch)
+BLOCKS = (accuracy, peers, render, process, load, load_large, startup, scaling, memory, batch)
 """What the README has a place for; each is made of the results of its name."""
 
 

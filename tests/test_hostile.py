@@ -216,3 +216,31 @@ def test_numbers_that_json_does_not_have_are_null(tmp_path):
     (grid,) = json.loads(ran.out)["grids"]
     assert grid["refusal"] == "transform with NaN or Inf"
     assert grid["world_from_index"][0][0] is None
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize(
+    ("volume", "options"),
+    [
+        ("rotated", ("--size", "64x48")),
+        ("cloud", ()),
+        ("cloud", ("--color-grid", "Cd", "--size", "1000x1000")),
+        ("cloud", ("--size", "2000x1500", "--bits", "16")),
+        ("ball", ("--size", "200x200")),
+        ("sparse", ("--size", "200x200")),
+    ],
+)
+def test_the_peak_is_near_the_memory_that_explain_promised(volume, options, tmp_path):
+    """`benchmarks/memory.py` goes on to fifty million voxels."""
+    path = SAMPLES / f"{volume}.vdb"
+    if volume in ("ball", "sparse"):
+        values = np.random.default_rng(2).random((200, 200, 200), np.float32)
+        if volume == "sparse":
+            values[20:] = 0
+        path = tmp_path / "a.npy"
+        np.save(path, values)
+    out = tmp_path / ("a.png" if "--bits" in options else "a.exr")
+    command = ["render", path, "-o", out, *options, "--explain", "--json", "--quiet"]
+    command = [sys.executable, "-c", "from volcli.cli import main; main()", *map(str, command)]
+    told = json.loads(subprocess.run(command, capture_output=True, timeout=240).stdout)
+    assert 0.8 < told["peak_memory_bytes"] / told["memory_bytes"] < 1.2

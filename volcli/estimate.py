@@ -15,10 +15,15 @@ from volcli.plan import Plan, make_plan
 from volcli.scene import Volumes, open_volumes
 from volcli.schema import Job
 
-PROCESS = 215_000_000
-"""Bytes of a process that holds nothing: Python, NumPy, numba and kernels."""
-PIXEL = 86.0
-"""Bytes a pixel of an EXR while it is written and read back, measured."""
+PROCESS = 245_000_000
+"""Bytes of a process that holds nothing: Python, NumPy, numba and kernels. Measured 215 MB, and 290
+where kernels are compiled: which it will be is not known before.
+"""
+PIXEL = {".exr": 82.0, ".png": 104.0}
+"""Bytes a pixel while a picture is made, written and read back, measured."""
+
+_AFTER_LOADING = 60_000_000
+"""The part of `PROCESS` that is there only once all grids are read."""
 
 _AMPLE = 100
 """A grid takes less than so many times its bytes in the file, hostile files apart."""
@@ -52,8 +57,8 @@ def needed_memory(job: Job, plan: Plan, volumes: Volumes, pixels: int | None = N
     most = held = 0
     for volume, header in _grids(plan, volumes):
         census = _census(volume, header, volume.path.stat().st_mtime_ns)
-        most = max(most, held + census.mapped_bytes + census.loading_bytes)
-        held += census.mapped_bytes + census.grid_bytes
+        most = max(most, held + census.mapped_bytes + census.loading_bytes - _AFTER_LOADING)
+        held += census.grid_bytes + (census.mapped_bytes if census.stays_mapped else 0)
         if plan.max_error is not None:
             dense = header is plan.density
             held += census.bricks * (BYTES_A_BRICK if dense else BYTES_A_BRICK_OF_SOURCE)
@@ -95,7 +100,9 @@ def plan_of(job: Job, volumes: Volumes) -> Plan:
 
 def _picture(job: Job, pixels: int | None) -> int:
     width, height = job.camera.size
-    return int(PIXEL * (width * height if pixels is None else pixels))
+    image = job.output.image
+    each = PIXEL[".png" if image is not None and image.suffix.lower() == ".png" else ".exr"]
+    return int(each * (width * height if pixels is None else pixels))
 
 
 def _grids(plan: Plan, volumes: Volumes) -> list[tuple[Volume, GridHeader]]:

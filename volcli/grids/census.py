@@ -34,6 +34,8 @@ class Census:
         That are built of it.
     mapped_bytes
         Of the file, as far as it is mapped into memory while it is read.
+    stays_mapped
+        Whether it still is while the grid is rendered.
     """
 
     leaves: int
@@ -42,6 +44,7 @@ class Census:
     grid_bytes: int
     bricks: int = 0
     mapped_bytes: int = 0
+    stays_mapped: bool = True
 
     @property
     def loading_bytes(self) -> int:

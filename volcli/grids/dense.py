@@ -17,7 +17,7 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +66,8 @@ class DenseVolume:
             raise no_room(f"{self.path}: grid '{header.label}'", error) from error
 
     def census(self, header: GridHeader) -> Census:
-        """How much a grid holds at most: leaves of zeros alone, of which it says nothing, too.
+        """How much a grid holds: of a ``.npy`` file, which is mapped, without its leaves of zeros
+        alone; of an archive, whose values are packed, at most.
 
         Raises
         ------
@@ -75,21 +76,26 @@ class DenseVolume:
         """
         if header.refusal or header.active_box is None:
             raise VolumeError(f"{self.path}: grid '{header.label}': {header.refusal}")
+        is_npy = _is_npy(self.path)
         counts = [end // LEAF_WIDTH + 1 for end in header.active_box[1]]
-        bricks = [count + 1 for count in counts]
+        leaves, bricks = math.prod(counts), math.prod(count + 1 for count in counts)
+        if is_npy:
+            used = _used_leaves(_load(self.path, header.name))
+            leaves, bricks = int(used.sum()), _reached(used)
         dtype = np.dtype(header.value_type.removeprefix("vec3"))
         if dtype == np.bool_ or dtype == np.float16:
             dtype = np.dtype(np.float32)
-        return census_of(
-            leaves=math.prod(counts),
-            bricks=math.prod(bricks),
+        counted = census_of(
+            leaves=leaves,
+            bricks=bricks,
             blocks=math.prod(count // 16 + 2 for count in counts),
             roots=math.prod(count // 512 + 2 for count in counts),
             tiles=0,
             dtype=np.dtype((dtype, 3)) if header.is_vector else dtype,
-            copies=2,
-            mapped_bytes=header.file_bytes or 0 if _is_npy(self.path) else 0,
+            copies=1 if is_npy else 2,
+            mapped_bytes=header.file_bytes or 0 if is_npy else 0,
         )
+        return replace(counted, stays_mapped=False)
 
 
 def open_dense(path: Path) -> DenseVolume:
@@ -162,6 +168,29 @@ def tree_from_array(values: NDArray[Any]) -> Tree:
         tile_values=np.empty((0, *channels), values.dtype),
         tile_active=np.empty(0, bool),
     )
+
+
+def _used_leaves(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """(bx, by, bz): which leaves of an array hold another value than 0."""
+    w = LEAF_WIDTH
+    counts = [-(-n // w) for n in values.shape[:3]]
+    used = np.zeros(counts, bool)
+    for bx in range(counts[0]):  # one slab at a time, as `tree_from_array`
+        columns = np.zeros((counts[1] * w, counts[2] * w), bool)
+        nonzero = (values[bx * w : (bx + 1) * w] != 0).any(axis=0)
+        columns[: values.shape[1], : values.shape[2]] = nonzero.reshape(*values.shape[1:3], -1).any(
+            axis=-1
+        )
+        used[bx] = columns.reshape(counts[1], w, counts[2], w).any(axis=(1, 3))
+    return used
+
+
+def _reached(used: NDArray[np.bool_]) -> int:
+    """How many bricks read a leaf that is used: its own, and those below it along each axis."""
+    reached = np.pad(used, ((1, 0),) * 3)
+    for axis in range(3):
+        reached |= np.roll(reached, -1, axis)  # what comes round is the empty layer
+    return int(reached.sum())
 
 
 def _blocks(slab: NDArray[Any], ny: int, nz: int) -> NDArray[Any]:
