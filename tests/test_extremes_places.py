@@ -202,5 +202,5 @@ def test_every_rule_gives_what_its_closed_form_says(case, tmp_path):
     if case.tau is not None:
         assert_closed_form(case)
     assert_exact(case, tmp_path)
-    assert_certified(case, tmp_path)
+    assert_certified(case, tmp_path, 1e-1)
     assert_midpoint(case, tmp_path)

@@ -30,7 +30,7 @@ ROUNDED = 3e-7
 PLACED = 1e-12
 """What positions are off by, in voxels, of volumes that are some tens away."""
 
-FEW = settings(max_examples=12)
+FEW = settings(max_examples=10)
 """Pictures are dear; the other examples are rules and the pixels of each."""
 
 EVERY = pytest.mark.parametrize("rule", RULES)
