@@ -336,7 +336,7 @@ def test_rays_on_the_faces_of_the_box_see_the_nothing_that_is_there():
 
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, -1, 0), (0, 0, 1), (1, 1, 0), (0, -1, 1)])
-@pytest.mark.parametrize("tilt", [0.0, 1e-300, 1e-17, 1e-9])
+@pytest.mark.parametrize("tilt", [0.0, 1e-310, 1e-300, 1e-17, 1e-9])
 def test_directions_with_components_of_0_or_next_to_0_are_exact(direction, tilt):
     """1 / d is infinite or huge; 0 times it must not be NaN."""
     m = of(scenes.random_values(26, (12, 12, 12)))
@@ -350,6 +350,27 @@ def test_directions_with_components_of_0_or_next_to_0_are_exact(direction, tilt)
     result = shoot(m, view, 0.3)
     assert_sound(result)
     assert np.abs(result.transmittance - np.exp(-tau)).max() < EXACT
+
+
+@pytest.mark.parametrize("tilt", [1e-310, -1e-310, -5e-324])
+@pytest.mark.parametrize(
+    "rule", [{}, {"step": 0.5}, {"nearest": True}, {"max_error": 0.01}], ids=str
+)
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_directions_whose_inverse_is_infinite_are_those_along_an_axis(axis, rule, tilt):
+    """In a lattice plane, where the distance to the next one is 0 times infinity. By packets, and
+    ray by ray where colour varies."""
+    eye, target = np.zeros(3), np.zeros(3)
+    eye[axis], target[axis] = -9.0, 1.0
+    target[(axis + 1) % 3] = 10 * tilt
+    up = np.roll((0.0, 0.0, 1.0), axis)
+    view = View(tuple(eye), tuple(target), tuple(up), width=1e-3, resolution=(1, 1))
+    grey = medium(np.full((9, 9, 9, 3), 0.5), background=(0.5, 0.5, 0.5))
+    for colour in ((0.5, 0.5, 0.5), grey):
+        result = shoot(of(np.ones((8, 8, 8))), view, 0.1, colour, **rule)
+        bound = 1e-6 if result.error_bound is None else float(result.error_bound[0, 0])
+        assert result.transmittance[0, 0] == pytest.approx(np.exp(-0.8), abs=bound)
+        assert result.radiance[0, 0, 0] == pytest.approx(-0.5 * np.expm1(-0.8), abs=bound)
 
 
 def test_the_reference_knows_its_closed_forms():

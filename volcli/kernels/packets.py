@@ -43,6 +43,7 @@ from volcli.kernels.packet_walk import (
     root_planes,
     root_segments,
 )
+from volcli.kernels.traversal import straight
 
 
 def packet_buffer(bounds):
@@ -173,7 +174,7 @@ def integrate_packets(
         row = numbers() + first
         here = row < len(origins)
         eye = to_local(m, origins, row, here, 1.0)
-        d = to_local(m, directions, row, here, 0.0)
+        d = straight(to_local(m, directions, row, here, 0.0))
         t_near, t_far = floats(0.0), floats(math.inf)
         t_near, t_far = clip_axis(box[0, 0], box[1, 0], eye[0], d[0], t_near, t_far)
         t_near, t_far = clip_axis(box[0, 1], box[1, 1], eye[1], d[1], t_near, t_far)

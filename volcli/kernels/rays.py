@@ -31,6 +31,7 @@ from volcli.kernels.traversal import (
     root_exit,
     root_next,
     root_segments,
+    straight,
 )
 
 
@@ -89,7 +90,7 @@ def clip_to(box, o, d):
 def path_of(source, origins, directions, n, t_start, shift, everywhere):
     """`Path` of ray n through a source, distances counted from t_start."""
     o = to_local(source.local_from_world, origins, n, 1.0)
-    d = to_local(source.local_from_world, directions, n, 0.0)
+    d = straight(to_local(source.local_from_world, directions, n, 0.0))
     ray = make_ray(move(o, d, t_start, shift), d)
     if everywhere:
         return Path(ray, -math.inf, math.inf)
@@ -251,12 +252,12 @@ def integrate_rays(
     evaluated = 0
     for n in range(len(origins)):
         eye = to_local(density.local_from_world, origins, n, 1.0)
-        d = to_local(density.local_from_world, directions, n, 0.0)
+        d = straight(to_local(density.local_from_world, directions, n, 0.0))
         begin, end = clip_to(density.support, eye, d)
         t_near, t_far = begin, end
         if emission is not None:
             o = to_local(emission.local_from_world, origins, n, 1.0)
-            to = to_local(emission.local_from_world, directions, n, 0.0)
+            to = straight(to_local(emission.local_from_world, directions, n, 0.0))
             emission_begin, emission_end = clip_to(emission.support, o, to)
             t_near, t_far = min(t_near, emission_begin), max(t_far, emission_end)
         state = State(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, t_far - t_near, 0.0)

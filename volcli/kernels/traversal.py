@@ -19,12 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from volcli.kernels.compiler import jit
+from volcli.kernels.lanes import pick
 
 BRICK = 8
 MACRO = 32
 BLOCK = 128
 ROOT = 4096
 BACKGROUND = -1
+
+LEADS_NOWHERE = 2.0**-200
+"""As a share of a direction's largest component: less moves a ray, from one end of the lattice to
+the other, by no more than 2^-168 voxels."""
 
 SEGMENTS = 94 * 10 * 10
 """A ray meets at most 3*(32 - 1) + 1 blocks of a root cell, 3*(4 - 1) + 1 macro cells of each and
@@ -98,6 +103,15 @@ def clip(lo, hi, o, d):
             t_near = max(t_near, min(a, b))
             t_far = min(t_far, max(a, b))
     return t_near, t_far
+
+
+@jit
+def straight(d):
+    """The direction d (x, y, z), components that lead nowhere as 0: 1 / d of a denormal number is
+    infinite, and 0 times that is NaN. Takes registers, too."""
+    x, y, z = max(d[0], -d[0]), max(d[1], -d[1]), max(d[2], -d[2])
+    least = max(x, max(y, z)) * LEADS_NOWHERE
+    return pick(x < least, 0.0, d[0]), pick(y < least, 0.0, d[1]), pick(z < least, 0.0, d[2])
 
 
 @jit
