@@ -28,15 +28,17 @@ def main() -> int:
         print(f"{asked.write}: {made.seed.name}, damaged")
         return 0
     numbers = range(asked.first, asked.first + asked.cases)
+    told = {"findings": 0}
     with tqdm(total=asked.cases, unit=" files", file=sys.stderr, mininterval=1.0) as bar:
 
         def progress(tally: Tally) -> None:
+            for finding in tally.findings[told["findings"] :]:
+                bar.write(f"case {finding.number}: {finding.what}\n")
+            told["findings"] = len(tally.findings)
             bar.set_postfix(findings=len(tally.findings), refresh=False)
             bar.update(tally.cases - bar.n)
 
         tally = fuzz(numbers, kinds=asked.kinds, workers=asked.workers, progress=progress)
-    for finding in tally.findings:
-        print(f"case {finding.number}: {finding.what}\n")
     ends = ", ".join(f"{count:,} with {code}" for code, count in sorted(tally.codes.items()))
     print(f"{tally.cases:,} files: {len(tally.findings)} findings; ended {ends}")
     print(f"peak memory {tally.peak_bytes / 1e6:.0f} MB")

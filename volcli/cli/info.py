@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from volcli.cli.options import option
-from volcli.cli.table import in_bytes, say, say_json, table, terminal_width
+from volcli.cli.table import in_bytes, in_short, say, say_json, table, terminal_width
 
 
 def info(
@@ -40,11 +40,12 @@ def info(
     if grids:
         say(_tables(grids, _GROUPS if stats else _GROUPS[:-1]))
     for grid in grids:
+        name = in_short(grid["grid"])
         if grid["refusal"]:
-            say(f"{grid['grid']}: cannot be rendered: {grid['refusal']}")
+            say(f"{name}: cannot be rendered: {grid['refusal']}")
         if grid.get("optical_depth"):
             median = f"median optical depth through the box {grid['optical_depth']['50']:.3g}"
-            say(f"{grid['grid']}: {median}{'; ' + grid['advice'] if grid['advice'] else ''}")
+            say(f"{name}: {median}{'; ' + grid['advice'] if grid['advice'] else ''}")
 
 
 _Columns = list[tuple[str, str]]
@@ -99,6 +100,8 @@ def _cell(value: Any, key: str) -> str:
         return "-"
     if key == "memory_bytes":
         return in_bytes(value)
+    if key == "grid":
+        return in_short(value)
     if key == "voxel_size" and len({f"{v:.6g}" for v in value}) == 1:
         return f"{value[0]:.6g}"
     if isinstance(value, float):

@@ -7,8 +7,10 @@ import math
 import os
 import shutil
 import sys
+import textwrap
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import zip_longest
 from typing import Any
 
 from volcli.errors import OutputError
@@ -60,23 +62,50 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], width: int | None 
     ----------
     width
         Where the columns do not fit, those that are left over follow as a further table, which
-        repeats the first column. None: they always fit.
+        repeats the first column; text that does not fit beside it goes on below. None: they
+        always fit.
     """
     lines = [list(head), *[list(row) for row in rows]]
-    widths = [max(_columns(line[i]) for line in lines) for i in range(len(head))]
+    if width is None:
+        cells = [[[text] for text in line] for line in lines]
+    else:
+        first = min(max(_columns(line[0]) for line in lines), width // 2)
+        limits = [first] + [width - first - 2] * (len(head) - 1)
+        cells = [
+            [_wrapped(text, limit) for text, limit in zip(line, limits, strict=True)]
+            for line in lines
+        ]
+    widths = [max(_columns(part) for line in cells for part in line[i]) for i in range(len(head))]
     groups: list[list[int]] = [[0]]
     for column in range(1, len(head)):
         taken = sum(widths[i] + 2 for i in groups[-1])
         if width is not None and len(groups[-1]) > 1 and taken + widths[column] > width:
             groups.append([0])
         groups[-1].append(column)
-    return "\n\n".join(
-        "\n".join(
-            "  ".join(line[i] + " " * (widths[i] - _columns(line[i])) for i in group).rstrip()
-            for line in lines
-        )
-        for group in groups
-    )
+
+    def row(line: list[list[str]], group: list[int]) -> Iterator[str]:
+        for parts in zip_longest(*(line[i] for i in group), fillvalue=""):
+            padded = (
+                part + " " * (widths[i] - _columns(part))
+                for i, part in zip(group, parts, strict=True)
+            )
+            yield "  ".join(padded).rstrip()
+
+    return "\n\n".join("\n".join(text for line in cells for text in row(line, g)) for g in groups)
+
+
+def _wrapped(text: str, limit: int) -> list[str]:
+    """A text in lines of no more columns than ``limit``."""
+    if _columns(text) <= limit:
+        return [text]
+    letters = limit if _columns(text) == len(text) else max(1, limit // 2)  # wide ones take two
+    return textwrap.wrap(text, letters, break_on_hyphens=False) or [""]
+
+
+def in_short(text: str, limit: int = 40) -> str:
+    """A text with its middle left out where it has more characters than ``limit``."""
+    half = (limit - 3) // 2
+    return text if len(text) <= limit else f"{text[:half]}...{text[-half:]}"
 
 
 def _columns(text: str) -> int:
