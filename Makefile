@@ -23,6 +23,19 @@ lint: $(SETUP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+.PHONY: fuzz audit
+
+# Damaged files, for a quarter of an hour.
+fuzz: $(SETUP)
+	$(BIN)/python -m fuzz --cases 20000
+
+# What is known of the versions that are installed; needs a network.
+audit: $(SETUP)
+	$(PYTHON) -m venv build/audit
+	build/audit/bin/python -m pip install --quiet --disable-pip-version-check pip-audit
+	build/audit/bin/pip-audit --skip-editable \
+	    --path "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"
+
 # Takes a quarter of an hour on an idle machine. Volumes are made by OpenVDB, beside whose vdb_render
 # volcli is measured (Debian: python3-openvdb, libopenvdb-tools). Mitsuba compiles with an LLVM
 # newer than 15 (tried: 22), which DRJIT_LIBLLVM_PATH can name, and otherwise runs without.
