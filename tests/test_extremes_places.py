@@ -147,8 +147,8 @@ DIRECTIONS = [
           mpf(8)),
     *(row(f"with {tilt:g} across", EIGHT, (-9, 3, 3), (1, 3 + 10 * tilt, 3 + 10 * tilt), mpf(8))
       for tilt in (1e-300, 1e-17)),
-    *(row(f"with {tilt:g} across, in a lattice plane", EIGHT, (-9, 0, 0), (1, 10 * tilt, -10 * tilt),
-          mpf(8)) for tilt in (1e-300, 1e-310, -1e-310, 5e-324)),
+    *(row(f"with {tilt:g} across, in a lattice plane", EIGHT, (-9, 0, 0),
+          (1, 10 * tilt, -10 * tilt), mpf(8)) for tilt in (1e-300, 1e-310, -1e-310, 5e-324)),
     row("with 1e-9 across", ONE, (-9, 0, 0), (1, 1e-8, 0), None),
     row("with 1e-9 along", [cube(2)], (1e-8, -9, 0.5), (0, 1, 0.5), None),
     row("with 1e-300 across, next to an edge", ONE, (-9, 0.5, 1e-300), (0, 0.5, -1e-300), HALF),
