@@ -1,13 +1,21 @@
 """Ray by ray, no light is farther from the truth than its certificate, and no certificate above
 what was allowed.
 
-The truth is that of `volcli.probe`, whose intervals are cut so finely that tables bend in none.
+The truth is that of `volcli.probe`, whose intervals are cut so finely that tables hardly bend in
+one; of many rays at once the rule itself at an error that is far smaller, for which it goes another
+way.
 """
 
 from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scenes import (
     IDENTITY,
     View,
@@ -22,12 +30,16 @@ from scenes import (
 
 import volcli.probe.walk
 from volcli.bounds import scene_bounds
+from volcli.camera import make_camera
+from volcli.grids import density_grid, load_density, load_source, open_volume
 from volcli.probe.field import cuts
 from volcli.render import PIXEL_ERROR, Scene, Source, make_integrator
+from volcli.schema import Camera
 from volcli.tables import ColorTable, TransferTable
 
 ALLOWED = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
-VIEW = View(eye=(24, 21, 30), target=(8, 8, 8), fov=30, resolution=(7, 6))
+COMPILED = not numba.config.DISABLE_JIT
+VIEW = View((24, 21, 30), (8, 8, 8), fov=30, resolution=(7, 6) if COMPILED else (3, 2))
 SHAPE = (17, 17, 17)
 TURNED = affine(0.8 * rotation((1, 2, 3), 37.0), (1.0, 0.5, -0.5))
 
@@ -89,8 +101,10 @@ def rays_of(view):
     return tuple(np.ascontiguousarray(part.reshape(-1, 3)) for part in view.rays)
 
 
-def truth(scene, nearest, rays, monkeypatch, pieces=24):
+def truth(scene, nearest, rays, monkeypatch):
     """(n, 3), (n, 3): transmittances and radiances."""
+    sources = (scene.color, scene.emission)
+    pieces = 96 if any(isinstance(source, Source) and source.table for source in sources) else 1
 
     def fine(line, t0, t1):
         t = cuts(line, t0, t1)
@@ -119,7 +133,7 @@ def seen(scene, nearest, rays, max_error):
 
 def off_by(scene, found, true):
     """(n,): by how much transmittance, and radiance as a share of the brightest, are off."""
-    T, light = (np.abs(a - b).max(axis=1) for a, b in zip(found[:2], true, strict=True))
+    T, light = (np.abs(a - b).max(axis=1) for a, b in zip(found[:2], true[:2], strict=True))
     return np.maximum(T, light / scene.bounds.brightest)
 
 
@@ -140,6 +154,90 @@ def check(scene, nearest, rays, monkeypatch, allowed=ALLOWED):
 def test_no_ray_is_farther_from_the_truth_than_certified(name, scale, monkeypatch):
     scene = scene_of(SCENES[name], scale)
     evaluated = check(scene, False, rays_of(VIEW), monkeypatch)
-    steps = zip(evaluated[:-1], evaluated[1:], strict=True)
-    assert all(more <= 1.01 * less for more, less in steps)  # what is allowed saves work
+    steps = pairwise(evaluated)
+    assert all(more <= 1.02 * less for more, less in steps)  # what is allowed saves work
     assert evaluated[0] < evaluated[-1]
+
+
+@pytest.mark.parametrize("scale", [0.1, 10.0])
+@pytest.mark.parametrize("name", ["a transfer function", "colours below 0", "all at once"])
+def test_so_it_is_with_the_nearest_voxel(name, scale, monkeypatch):
+    check(scene_of(SCENES[name], scale, nearest=True), True, rays_of(VIEW), monkeypatch)
+
+
+@settings(max_examples=40 if COMPILED else 3)
+@given(
+    seed=st.integers(0, 1000),
+    zeros=st.floats(0, 1),
+    scale=st.floats(-3, 3).map(lambda x: 10**x),
+    less=st.floats(0, 1),
+    allowed=st.floats(-5, -0.1).map(lambda x: 10**x),
+    turn=st.floats(0, 90),
+)
+def test_whatever_the_grids_are(seed, zeros, scale, less, allowed, turn):
+    density = medium(random_values(seed, (9, 10, 12), zeros))
+    values = random_colours(seed + 1, (9, 10, 12)) - np.float32(less)
+    colour = medium(
+        values, background=(0, 0, 0), world_from_index=affine(rotation((1, 2, 3), turn))
+    )
+    scene = scene_of({"density": density, "color": Source(colour.grid)}, scale)
+    view = View((24, 21, 30), (5, 5, 5), fov=24, resolution=(4, 3))
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        check(scene, False, rays_of(view), monkeypatch, [allowed])
+
+
+SHARED = Path(__file__).parents[2] / "shared/volumes/real"
+FILES = {
+    "cloud": Path(__file__).parents[1] / "samples/cloud.vdb",
+    "smoke": SHARED / "smoke.vdb",
+    "wdas cloud": SHARED / "wdas_cloud_sixteenth.vdb",
+}
+FAR_SMALLER = 1e-9
+"""An error for which next to nothing is taken as a whole, and cells are cut till they are exact."""
+
+
+@cache
+def grids_of(path):
+    """The density of a file, and as a source."""
+    volume = open_volume(path)
+    header = density_grid(volume, None)[0]
+    return load_density(volume, header, "error")[0], load_source(volume, header, "error")[0]
+
+
+def in_file(name, lit):
+    """(scene, rays) of a file under light by value: of colour, or of emission and tint."""
+    if not FILES[name].exists():
+        pytest.skip(f"{FILES[name].name} is not here")
+    density, source = grids_of(FILES[name])
+    high = density.field_range[1]
+    table = ColorTable(KINKS.knots * high, KINKS.colors)
+    box = density.world_box()
+    size = np.linalg.norm(box[1] - box[0])
+    parts = {"color": Source(source, table)}
+    if lit == "emission":
+        parts = {
+            "color": (0.2, 0.2, 0.2),
+            "emission": Source(source, table, 5 / size),
+            "tint": (1.0, 0.6, 0.3),
+        }
+    made = Scene(density, 20.0 / size / high, **parts)
+    camera = make_camera(Camera(resolution=(48, 36)), box)
+    rays = camera.rays(slice(None), slice(None))
+    return replace(made, bounds=scene_bounds(made, False)), rays
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("lit", ["colour", "emission"])
+@pytest.mark.parametrize("name", FILES)
+def test_no_pixel_of_a_file_is_farther_off_than_certified(name, lit):
+    scene, rays = in_file(name, lit)
+    true = seen(scene, False, rays, FAR_SMALLER + 2 * PIXEL_ERROR)
+    assert true[2].max() <= FAR_SMALLER
+    shares = []
+    for max_error in (1e-1, 1e-2, 1 / 255, 1e-3, 1e-4, 1e-5):
+        found = seen(scene, False, rays, max_error)
+        assert (found[2] + PIXEL_ERROR <= max_error).all()
+        assert (off_by(scene, found, true) <= found[2] + FAR_SMALLER + 1e-11).all()
+        shares.append(found[3] / true[3])
+    print(f"{name}, {lit}: evaluations", *(f"{share:.2f}" for share in shares))
+    assert shares[0] < shares[-1] <= 1.01

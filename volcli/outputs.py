@@ -62,6 +62,7 @@ def write_outputs(
         "optical_depth": result.optical_depth,
         "depth": result.depth,
         "error_bound": result.error_bound,
+        "error_estimate": result.error_estimate,
     }
     warnings: list[str] = []
     maps: dict[str, dict[str, Any]] = {}
@@ -99,4 +100,6 @@ def _write_exr(
     channels |= images.layer_channels("optical_depth", result.optical_depth)
     if result.error_bound is not None:
         channels |= images.layer_channels("error_bound", result.error_bound)
+    if result.error_estimate is not None:
+        channels |= images.layer_channels("error_estimate", result.error_estimate)
     images.write_exr(path, channels, header, overwrite=overwrite)

@@ -70,6 +70,8 @@ class Plan:
         (`volcli.calibrate`); None where there is nothing to choose.
     nearest
         Whether values are those of the nearest voxel.
+    estimate
+        Whether what the exact rule is off by is estimated.
     terms
         The same for people.
     warnings
@@ -87,6 +89,7 @@ class Plan:
     max_error: float | None
     target_error: float | None
     nearest: bool
+    estimate: bool
     terms: tuple[Term, ...]
     warnings: tuple[str, ...]
 
@@ -145,6 +148,7 @@ def make_plan(
         max_error=job.quadrature.max_error or None,  # 0 is exact
         target_error=job.quadrature.target_error or None,
         nearest=job.density.interpolation == "nearest",
+        estimate="error_estimate" in layers,
         terms=tuple(_terms(job, layers, (density, color, emission), files)),
         warnings=tuple(dict.fromkeys(warnings)),
     )
@@ -251,6 +255,11 @@ def _terms(
         terms.append(Term("error bound", True, why))
     else:
         terms.append(Term("error bound", False, "quadrature.max_error allows none"))
+    if "error_estimate" in layers:
+        why = "the map asks for it: of radiance, from the samples of each cell and an embedded rule"
+        terms.append(Term("error estimate", True, why))
+    else:
+        terms.append(Term("error estimate", False, "no map asks for it"))
     if job.background.color is not None:
         terms.append(Term("background", True, "one colour"))
     elif job.background.image is not None:

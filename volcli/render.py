@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from volcli.bounds import SceneBounds
+from volcli.bounds import SceneBounds, brightest_light
 from volcli.camera import Camera
 from volcli.errors import NonFiniteError, UsageError
 from volcli.grids import BrickGrid, Progress
@@ -113,6 +113,9 @@ class RenderResult:
         (h, w) float32: no farther than this are transmittance and opacity (each channel of them)
         from what they would be without ``Plan.max_error``, nor is radiance, as a share of the
         brightest light that the scene can show; rounding included. None where nothing was allowed.
+    error_estimate
+        (h, w) float32: what radiance is estimated to be off by, by the exact rule, as a share of
+        the brightest light; rounding included. No bound. None where nobody asked.
 
     Of a pixel with several samples each is the mean over them. For optical depth that is what lies
     behind the pixel on average (mass over area), no longer -log of the mean transmittance, which
@@ -131,6 +134,7 @@ class RenderResult:
     opacity: Floats
     depth: Floats | None
     error_bound: Floats | None
+    error_estimate: Floats | None
     evaluations: int
     compile_seconds: float
     render_seconds: float
@@ -189,10 +193,12 @@ def render(
     light = layer(0, 3)
     depth = layer(np.inf) if plan.depth else None
     bound = None if plan.max_error is None else layer(PIXEL_ERROR)
+    doubt = layer(PIXEL_ERROR) if plan.estimate else None
+    brightest = brightest_light(scene, plan.nearest, threads) if plan.estimate else 0.0
     constant = np.array(scene.color) if isinstance(scene.color, tuple) else None
 
     begin = time.perf_counter()
-    integrate = make_integrator(scene, plan)
+    integrate = make_integrator(scene, plan, estimate=plan.estimate)
     nothing = np.empty((0, 3))
     integrate(nothing, nothing)  # compiles
     compiled = time.perf_counter()
@@ -225,6 +231,10 @@ def render(
         if bound is not None:
             assert ray_error is not None, "as above"
             bound[rows, columns] = _upwards(_mean(ray_error.reshape(shape)) + PIXEL_ERROR)
+        if doubt is not None and brightest > 0:
+            assert ray_error is not None, "as above"
+            share = _mean(ray_error.reshape(shape)) / brightest
+            doubt[rows, columns] = _upwards(share + PIXEL_ERROR)
         return evaluations
 
     evaluations = 0
@@ -247,6 +257,7 @@ def render(
         opacity=opacity,
         depth=depth,
         error_bound=bound,
+        error_estimate=doubt,
         evaluations=evaluations,
         compile_seconds=compiled - begin,
         render_seconds=time.perf_counter() - compiled,
@@ -320,8 +331,14 @@ def over(result: RenderResult, background: Floats | None) -> Floats:
     return picture
 
 
-def make_integrator(scene: Scene, plan: Plan) -> Integrator:
-    """A function of (origins, directions) to (tau, radiance, distance, evaluations)."""
+def make_integrator(scene: Scene, plan: Plan, *, estimate: bool = False) -> Integrator:
+    """A function of origins and directions to `kernels.integrator.Traced`.
+
+    Parameters
+    ----------
+    estimate
+        Whether the error of the exact rule's radiance is to be estimated.
+    """
     from volcli.kernels import integrator
     from volcli.kernels.rays import Density
     from volcli.kernels.transfer import Transfer
@@ -345,6 +362,7 @@ def make_integrator(scene: Scene, plan: Plan) -> Integrator:
         nearest=plan.nearest,
         depth=plan.depth,
         bounds=_kernel_bounds(scene, plan),
+        estimate=estimate,
     )
 
 

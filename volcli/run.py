@@ -127,6 +127,8 @@ class Report:
         ``min``, ``mean``, ``max`` over the pixels.
     error_bound
         The largest of all pixels' certified errors; None where none was allowed.
+    error_estimate
+        The largest of all pixels' estimated errors; None where nobody asked.
     """
 
     image: str | None
@@ -138,6 +140,7 @@ class Report:
     seconds: dict[str, float]
     transmittance: dict[str, float]
     error_bound: float | None
+    error_estimate: float | None
     pilot: dict[str, Any] | None
     camera: dict[str, Any]
     peak_memory_bytes: int
@@ -338,7 +341,7 @@ def _use_kernels(prepared: Prepared) -> None:
     ramp = ColorTable(np.array([0.0, 1.0]), np.zeros((2, 3)))
     scene, _ = make_scene(job, plan, volumes, grids, table=lambda *_: ramp)
     nothing = np.empty((0, 3))
-    make_integrator(scene, plan)(nothing, nothing)
+    make_integrator(scene, plan, estimate=plan.estimate)(nothing, nothing)
     if plan.target_error is not None:
         make_integrator(scene, replace(plan, step_voxels=1.0))(nothing, nothing)
 
@@ -362,6 +365,8 @@ def write(
     }
     if result.error_bound is not None:
         header["volcli:error_bound"] = float(result.error_bound.max())
+    if result.error_estimate is not None:
+        header["volcli:error_estimate"] = float(result.error_estimate.max())
     if rendered.pilot is not None:
         header["volcli:target_error"] = rendered.pilot.target_error
         header["volcli:pilot"] = f"an estimate: {rendered.pilot.said}"
@@ -390,7 +395,8 @@ def write(
             "mean": float(result.transmittance.mean(dtype=np.float64)),
             "max": float(result.transmittance.max()),
         },
-        error_bound=None if result.error_bound is None else float(result.error_bound.max()),
+        error_bound=_largest(result.error_bound),
+        error_estimate=_largest(result.error_estimate),
         pilot=None if rendered.pilot is None else rendered.pilot.as_data(),
         camera=job.camera.model_dump(mode="json", exclude_none=True),
         peak_memory_bytes=peak_memory_bytes(),
@@ -424,3 +430,8 @@ def resolved(job: Job, camera: Camera) -> Job:
         if path is not None:
             parts[part] = table.model_copy(update={name: path.absolute()})
     return job.model_copy(update=parts)
+
+
+def _largest(layer: Any) -> float | None:
+    """The largest value of a layer, None if there is none."""
+    return None if layer is None else float(layer.max())

@@ -17,7 +17,9 @@ from volcli.sources import Color, DensityRamp, Emission
 
 Rule = Literal["exact", "midpoint"]
 Interpolation = Literal["linear", "nearest"]
-MapName = Literal["transmittance", "opacity", "optical_depth", "depth", "error_bound"]
+MapName = Literal[
+    "transmittance", "opacity", "optical_depth", "depth", "error_bound", "error_estimate"
+]
 MAPS: tuple[str, ...] = get_args(MapName)
 
 FINEST_ERROR = 1e-6
@@ -289,6 +291,16 @@ class Job(Part):
         if "error_bound" in self.output.maps and not self.quadrature.max_error:
             raise ValueError(
                 "output.maps: error_bound is what quadrature.max_error certifies; give one above 0"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _estimates_are_of_the_exact_rule(self) -> Job:
+        wanted, how = "error_estimate" in self.output.maps, self.quadrature
+        if wanted and (how.rule != "exact" or how.max_error or how.target_error):
+            raise ValueError(
+                "output.maps: error_estimate is of the exact rule; leave it out, or "
+                "quadrature.rule, max_error and target_error"
             )
         return self
 

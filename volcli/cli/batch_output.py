@@ -206,6 +206,8 @@ def _as_json(told: Told) -> dict[str, Any]:
     report = told.report
     if report.error_bound is not None:
         row["error_bound"] = report.error_bound
+    if report.error_estimate is not None:
+        row["error_estimate"] = report.error_estimate
     return {
         **row,
         "size": report.size,

@@ -241,7 +241,7 @@ def _printed(report: Report) -> dict[str, Any]:
     """A report as plain data: what there is of it."""
     printed = asdict(report)
     del printed["camera"]
-    for name in ("error_bound", "pilot"):
+    for name in ("error_bound", "error_estimate", "pilot"):
         if printed[name] is None:
             del printed[name]
     return printed
@@ -331,6 +331,11 @@ def _summary(report: Report) -> str:
         lines.append(
             f"certified: no pixel's transmittance, nor its radiance as a share of the brightest "
             f"light, is off by more than {report.error_bound:.3g}"
+        )
+    if report.error_estimate is not None:
+        lines.append(
+            f"an estimate: no pixel's radiance, as a share of the brightest light, is off by more "
+            f"than {report.error_estimate:.1g}"
         )
     lines.append(
         f"load {s['load']:.2f} s, compile {s['compile']:.2f} s, {pilot}render {s['render']:.2f} s, "

@@ -34,8 +34,7 @@ and what one part leaves is there for those behind. Once all that is still to co
 weaker than what is left to spend, it is spent on that: light is no longer added up, and optical
 depth, of which nothing is certified, goes on by the fits of bricks.
 
-Under a tint each channel has its own depth; the bounds take the extinction of the channel that is
-absorbed most and the transmittance of the one that is absorbed least.
+Under a tint each channel has its own depth and its own bound; the largest counts.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ from volcli.kernels.rules import (
     own_cell,
     reaches,
 )
-from volcli.kernels.state import State, reach, refresh, strongest, weakest
+from volcli.kernels.state import State, refresh, weakest
 
 DARK = ((0.0, 0.0, 0.0), 0.0)
 """As `bounded_source.region_colour`, where there is no such source."""
@@ -144,6 +143,7 @@ def bounded_segment(
                 tint,
                 nearest,
                 bounds,
+                None,
                 depth,
                 path,
                 emission_path,
@@ -183,20 +183,28 @@ def fit_along(density, bounds, entry, number, corner, ray, transfer, t, t_exit):
 
 @jit
 def part_error(state, fit, length, lit, glow, tint, bounds):
-    """What taking a part as a whole is off by at most: transmittance, and radiance as a share of
-    the brightest."""
-    tau, slack, bend = fit
-    low, high = weakest(tint), strongest(tint)
-    less = (1.0 - absorbed(low * (tau - slack))) * absorbed(high * slack)
-    light = bounds.contrast * less
-    light += share(lit[1] * absorbed(high * (tau + slack)), bounds)
+    """What taking a part as a whole is off by at most, in any channel: transmittance, and radiance
+    as a share of the brightest."""
+    if tint is None:
+        return state.T * channel_error(fit, length, lit, glow, 1.0, bounds)
+    r = math.exp(-tint[0] * state.tau) * channel_error(fit, length, lit, glow, tint[0], bounds)
+    g = math.exp(-tint[1] * state.tau) * channel_error(fit, length, lit, glow, tint[1], bounds)
+    b = math.exp(-tint[2] * state.tau) * channel_error(fit, length, lit, glow, tint[2], bounds)
+    return max(r, max(g, b))
+
+
+@jit
+def channel_error(fit, length, lit, glow, factor, bounds):
+    """`part_error` of a channel whose extinction has a factor, if all light reaches the part."""
+    tau, slack, bend = factor * fit[0], factor * fit[1], factor * fit[2]
+    less = (1.0 - absorbed(tau - slack)) * absorbed(slack)
+    light = lit[1] * absorbed(tau + slack)
     if glow[1] > 0.0 or slack + bend > 0.0:
         r, g, b = glow[0]
-        brightest = max(abs(r), max(abs(g), abs(b)))
-        drift = absorbed(high * (slack + bend))
-        through = min(1.0, mean_transmittance(low * tau) + drift)
-        light += share(length * (glow[1] * through + brightest * drift), bounds)
-    return reach(state, tint) * max(less, light)
+        drift = absorbed(slack + bend)
+        through = min(1.0, mean_transmittance(tau) + drift)
+        light += length * (glow[1] * through + max(abs(r), max(abs(g), abs(b))) * drift)
+    return max(less, bounds.contrast * less + share(light, bounds))
 
 
 @jit

@@ -42,8 +42,7 @@ colours of the least and the largest value there; where its slope varies by V in
 nowhere farther from its chord than V / 4 of that range of values. (With slopes from p to q the
 farthest is a triangle of height (q - s)(s - p) / (q - p), s being the chord's slope, of the range.)
 
-Under a tint each channel has its own extinction; the bound takes the largest of them with what
-reaches the part of the channel that is absorbed least.
+Under a tint each channel has its own extinction and its own bound; the largest counts.
 """
 
 from __future__ import annotations
@@ -65,7 +64,7 @@ from volcli.kernels.cell import (
 )
 from volcli.kernels.compiler import jit
 from volcli.kernels.source import NOWHERE, channel_values, colour_in, scalars, table_colour
-from volcli.kernels.state import State, reach, strongest
+from volcli.kernels.state import State
 from volcli.kernels.traversal import last_below
 
 OUTER_SHARE, INNER_SHARE = WEIGHT / (2.0 + 2.0 * WEIGHT), 1.0 / (2.0 + 2.0 * WEIGHT)
@@ -249,6 +248,27 @@ def span_error(s, half, hit, colour, emission):
 
 
 @jit
+def largest_error(state, s, half, part, lit, glow, tint):
+    """What the rule is off by at most in a part of optical depth ``part``, in any channel."""
+    if tint is None:
+        return state.T * span_error(s, half, absorbed(part), lit, glow)
+    return max(
+        tinted_error(state, s, half, part, lit, glow, tint[0]),
+        max(
+            tinted_error(state, s, half, part, lit, glow, tint[1]),
+            tinted_error(state, s, half, part, lit, glow, tint[2]),
+        ),
+    )
+
+
+@jit
+def tinted_error(state, s, half, part, lit, glow, factor):
+    """`largest_error` of a channel whose extinction has a factor."""
+    off = span_error(scaled(s, factor), half, absorbed(factor * part), lit, glow)
+    return math.exp(-factor * state.tau) * off
+
+
+@jit
 def add_bounded_span(
     state, span, colour, emission, tint, nearest, bounds, depth, colour_at, emission_at
 ):
@@ -261,7 +281,6 @@ def add_bounded_span(
         return state
     colours = source_cubics(colour, nearest, colour_at[0], colour_at[1], tm)
     glows = source_cubics(emission, nearest, emission_at[0], emission_at[1], tm)
-    thickest = scale * strongest(tint)
     length = end - u
     shortest = length * SHORTEST
     final = state.tau + whole
@@ -272,9 +291,8 @@ def add_bounded_span(
         lit = curves(colour, colour_at[0], colours, middle, half)
         glow = curves(emission, emission_at[0], glows, middle, half)
         part, at, w = hit_weights(p, scale, u, to)
-        s = scaled(shifted(p, middle, half), thickest)
-        off = span_error(s, half, absorbed(strongest(tint) * part), lit, glow)
-        error += reach(state, tint) * share(off, bounds)
+        s = scaled(shifted(p, middle, half), scale)
+        error += share(largest_error(state, s, half, part, lit, glow, tint), bounds)
         if error > bounds.max_error * (tm + to) / t_far and length > shortest:
             length *= 0.5
             continue

@@ -59,6 +59,7 @@ def make_integrator(
     nearest: bool,
     depth: bool,
     bounds: Bounds | None = None,
+    estimate: bool = False,
     packets: bool = LANES > 1,
 ) -> Integrator:
     """A function of origins and directions, (n, 3) float64 each, that any thread may call.
@@ -69,6 +70,8 @@ def make_integrator(
     ----------
     bounds
         What the rule may use instead of cells, and the error that it may make; None: exact.
+    estimate
+        Whether the error of radiance is to be estimated; of the exact rule, without bounds.
     packets
         Whether packets may be used.
     """
@@ -80,6 +83,8 @@ def make_integrator(
         from volcli.kernels.packets import integrate_packets, packet_buffer
 
         def run(rays: Any, distance: Any, error: Any, tau: Any, light: Any, buffer: Any) -> int:
+            if bounds is None:  # then nothing is off, by any estimate
+                error = None
             return integrate_packets(
                 *rays, density, *how, bounds, tint, distance, error, tau, *buffer
             )
@@ -92,10 +97,11 @@ def make_integrator(
         from volcli.kernels.traversal import segment_buffer
 
         terms = (transfer, colour, emission, tint)
+        guess = True if estimate else None
 
         def run(rays: Any, distance: Any, error: Any, tau: Any, light: Any, buffer: Any) -> int:
             return integrate_rays(
-                *rays, density, *terms, *how, bounds, distance, error, tau, light, buffer
+                *rays, density, *terms, *how, bounds, guess, distance, error, tau, light, buffer
             )
 
         make_buffer = segment_buffer
@@ -107,7 +113,7 @@ def make_integrator(
             kept.buffer = make_buffer()
         n = len(origins)
         tau, light, distance = np.zeros(n), np.zeros((n, 3)), np.empty(n) if depth else None
-        error = None if bounds is None else np.zeros(n)
+        error = np.zeros(n) if bounds is not None or estimate else None
         evaluated = run((origins, directions), distance, error, tau, light, kept.buffer)
         return Traced(tau, light, distance, error, int(evaluated))
 

@@ -26,6 +26,7 @@ from volcli.kernels.cell import (
     hit_weights,
 )
 from volcli.kernels.compiler import jit
+from volcli.kernels.doubt import colour_doubt, emission_doubt
 from volcli.kernels.source import kink_exit, source_at, source_cell
 from volcli.kernels.state import State, darken, strongest, weakest
 
@@ -40,65 +41,97 @@ STOP_TAU = -math.log(FADED)
 
 
 @jit
-def seen_colour(rgb, state, T, part, p, scale, u, to, at, w, colour, tint, nearest, cell, ray, tm):
-    """(r, g, b) with what particles between u and ``to`` emit, T being left at u.
+def samples_of(source, nearest, cell, ray, tm, at):
+    """The source's (r, g, b) at the four nodes."""
+    return (
+        source_at(source, nearest, cell, ray, tm + at[0]),
+        source_at(source, nearest, cell, ray, tm + at[1]),
+        source_at(source, nearest, cell, ray, tm + at[2]),
+        source_at(source, nearest, cell, ray, tm + at[3]),
+    )
+
+
+@jit
+def weighted(c, channel, w):
+    """The sum of one channel of four samples with weights."""
+    return w[0] * c[0][channel] + w[1] * c[1][channel] + w[2] * c[2][channel] + w[3] * c[3][channel]
+
+
+@jit
+def colour_weights(state, part, p, scale, u, to, w, tint):
+    """The weights of four samples of colour for each channel: what is hit between u and ``to``,
+    shared out.
 
     Under a tint each channel has an extinction of its own, and so its own weights.
     """
-    r, g, b = rgb
     if tint is None:
-        hr = hg = hb = T * absorbed(part)
-        wr = wg = wb = w
+        wr = wg = wb = times(w, state.T * absorbed(part))
     else:
         hr = math.exp(-tint[0] * state.tau) * absorbed(tint[0] * part)
         hg = math.exp(-tint[1] * state.tau) * absorbed(tint[1] * part)
         hb = math.exp(-tint[2] * state.tau) * absorbed(tint[2] * part)
-        wr = hit_weights(p, scale * tint[0], u, to)[2]
-        wg = hit_weights(p, scale * tint[1], u, to)[2]
-        wb = hit_weights(p, scale * tint[2], u, to)[2]
-    for n in range(4):
-        cr, cg, cb = source_at(colour, nearest, cell, ray, tm + at[n])
-        r += hr * wr[n] * cr
-        g += hg * wg[n] * cg
-        b += hb * wb[n] * cb
-    return r, g, b
+        wr = times(hit_weights(p, scale * tint[0], u, to)[2], hr)
+        wg = times(hit_weights(p, scale * tint[1], u, to)[2], hg)
+        wb = times(hit_weights(p, scale * tint[2], u, to)[2], hb)
+    return wr, wg, wb
 
 
 @jit
-def seen_emission(
-    rgb, state, T, begin, p, scale, u, to, at, emission, tint, nearest, cell, ray, tm
-):
-    """(r, g, b) with what is emitted between u and ``to`` whatever the density.
+def times(w, factor):
+    """Four weights times a factor."""
+    return w[0] * factor, w[1] * factor, w[2] * factor, w[3] * factor
+
+
+@jit
+def emission_weights(state, p, scale, u, to, at, tint):
+    """The weights of four samples of emission for each channel: lengths, times what reaches the
+    eye from there.
 
     The integral of e T du by Gauss' rule, at the nodes that `hit_weights` gave: T falls by at most
     exp(-`MAX_TAU`), and where nothing absorbs it is 1 to the bit.
     """
-    r, g, b = rgb
-    for n in range(4):
-        er, eg, eb = source_at(emission, nearest, cell, ray, tm + at[n])
-        length = (to - u) * (OUTER_SHARE if n == 0 or n == 3 else INNER_SHARE)
-        part = max(0.0, scale * (antiderivative(p, at[n]) - begin))
-        if tint is None:
-            reached = length * T * (1.0 - absorbed(part))
-            r += reached * er
-            g += reached * eg
-            b += reached * eb
-        else:
-            r += length * math.exp(-tint[0] * (state.tau + part)) * er
-            g += length * math.exp(-tint[1] * (state.tau + part)) * eg
-            b += length * math.exp(-tint[2] * (state.tau + part)) * eb
-    return r, g, b
+    outer, inner = (to - u) * OUTER_SHARE, (to - u) * INNER_SHARE
+    begin = antiderivative(p, u)
+    a = max(0.0, scale * (antiderivative(p, at[0]) - begin))
+    b = max(0.0, scale * (antiderivative(p, at[1]) - begin))
+    c = max(0.0, scale * (antiderivative(p, at[2]) - begin))
+    d = max(0.0, scale * (antiderivative(p, at[3]) - begin))
+    if tint is None:
+        T = state.T
+        wr = wg = wb = (
+            outer * T * (1.0 - absorbed(a)),
+            inner * T * (1.0 - absorbed(b)),
+            inner * T * (1.0 - absorbed(c)),
+            outer * T * (1.0 - absorbed(d)),
+        )
+    else:
+        tau = state.tau
+        wr = through(outer, inner, tint[0], tau + a, tau + b, tau + c, tau + d)
+        wg = through(outer, inner, tint[1], tau + a, tau + b, tau + c, tau + d)
+        wb = through(outer, inner, tint[2], tau + a, tau + b, tau + c, tau + d)
+    return wr, wg, wb
 
 
 @jit
-def add_span(state, span, colour, emission, tint, nearest, depth, colour_at, emission_at):
+def through(outer, inner, factor, a, b, c, d):
+    """`emission_weights` of a channel whose extinction has a factor."""
+    return (
+        outer * math.exp(-factor * a),
+        inner * math.exp(-factor * b),
+        inner * math.exp(-factor * c),
+        outer * math.exp(-factor * d),
+    )
+
+
+@jit
+def add_span(state, span, colour, emission, tint, nearest, estimate, depth, colour_at, emission_at):
     """Add the light of a span to the state.
 
     ``span`` is (p, scale, tm, t0, t1): over [t0, t1], density is the cubic ``p`` about the distance
     ``tm``. ``colour_at`` is the cell of the colour, and the ray in its voxels; and so for emission.
-    A span of optical depth above `MAX_TAU` is
-    added in parts, each half or twice as long as the one before, or the same, so that none is
-    above.
+    A span of optical depth above `MAX_TAU` is added in parts, each half or twice as long as the one
+    before, or the same, so that none is above. With ``estimate`` what the light is off by is
+    estimated and added up as well.
     """
     p, scale, tm, t0, t1 = span
     cell, ray = colour_at
@@ -121,42 +154,19 @@ def add_span(state, span, colour, emission, tint, nearest, depth, colour_at, emi
         part, at, w = hit_weights(p, scale, u, to)
         hit = T * absorbed(part)
         if colour is not None:
-            r, g, b = seen_colour(
-                (r, g, b),
-                state,
-                T,
-                part,
-                p,
-                scale,
-                u,
-                to,
-                at,
-                w,
-                colour,
-                tint,
-                nearest,
-                cell,
-                ray,
-                tm,
-            )
+            c = samples_of(colour, nearest, cell, ray, tm, at)
+            wr, wg, wb = colour_weights(state, part, p, scale, u, to, w, tint)
+            r, g, b = r + weighted(c, 0, wr), g + weighted(c, 1, wg), b + weighted(c, 2, wb)
+            if estimate is not None:
+                of = (state, p, scale, u, to, part, tint)
+                error += colour_doubt(colour.table, c, of, wr, wg, wb)
         if emission is not None:
-            r, g, b = seen_emission(
-                (r, g, b),
-                state,
-                T,
-                begin,
-                p,
-                scale,
-                u,
-                to,
-                at,
-                emission,
-                tint,
-                nearest,
-                emission_cell,
-                emission_ray,
-                tm,
-            )
+            c = samples_of(emission, nearest, emission_cell, emission_ray, tm, at)
+            wr, wg, wb = emission_weights(state, p, scale, u, to, at, tint)
+            r, g, b = r + weighted(c, 0, wr), g + weighted(c, 1, wg), b + weighted(c, 2, wb)
+            if estimate is not None:
+                of = (state, p, scale, u, to, part, tint)
+                error += emission_doubt(emission.table, c, of, wr, wg, wb)
         if depth is not None:
             mean = at[0] * w[0] + at[1] * w[1] + at[2] * w[2] + at[3] * w[3]
             moment += hit * (tm + mean)
@@ -183,6 +193,7 @@ def add_spans(
     tint,
     nearest,
     bounds,
+    estimate,
     depth,
     own,
     path,
@@ -217,7 +228,16 @@ def add_spans(
             )
         else:
             state = add_span(
-                state, span, colour, emission, tint, nearest, depth, colour_at, emission_at
+                state,
+                span,
+                colour,
+                emission,
+                tint,
+                nearest,
+                estimate,
+                depth,
+                colour_at,
+                emission_at,
             )
         t = t_exit
     return state
@@ -230,12 +250,24 @@ def faded(state, colour, emission, tint, depth):
 
     T alone does not tell: what is behind may be brighter than what is in front.
     """
-    if weakest(tint) * state.tau <= STOP_TAU:
+    if not faded_out(state, tint):
         return False
     T = math.exp(-weakest(tint) * state.tau)
-    seen = max(abs(state.r), max(abs(state.g), abs(state.b)))
+    seen = brightest_channel(state)
     if colour is not None and T * colour.brightest > FADED * seen:
         return False
     if emission is not None and T * emission.brightest * state.t_far > FADED * seen:
         return False
     return depth is None or T * state.t_far <= FADED * state.moment
+
+
+@jit
+def faded_out(state, tint):
+    """Whether no channel of what is still to come reaches the eye with more than `FADED` of it."""
+    return weakest(tint) * state.tau > STOP_TAU
+
+
+@jit
+def brightest_channel(state):
+    """The largest magnitude of what the ray has seen."""
+    return max(abs(state.r), max(abs(state.g), abs(state.b)))

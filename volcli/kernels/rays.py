@@ -5,7 +5,8 @@ caller shares batches out among threads. A ray's result depends on nothing but t
 are the same bit by bit for any number of threads.
 
 A term that a scene does not use is None (``transfer``, ``colour``, ``emission``, ``tint``,
-``depth``, ``step``, ``nearest``, ``bounds``): numba compiles a version of the loop without it.
+``depth``, ``step``, ``nearest``, ``bounds``, ``estimate``): numba compiles a version of the loop
+without it.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from volcli.kernels.bounded import bounded_segment, spend_rest
 from volcli.kernels.compiler import jit, kernel
+from volcli.kernels.light import FADED, brightest_channel, faded_out
 from volcli.kernels.rules import exact_segment, midpoint_segment
 from volcli.kernels.source import NOWHERE, Path
 from volcli.kernels.state import State, refresh
@@ -117,6 +119,7 @@ def add_segment(
     tint,
     nearest,
     bounds,
+    estimate,
     depth,
     path,
     emission_path,
@@ -181,6 +184,7 @@ def add_segment(
         tint,
         nearest,
         bounds,
+        estimate,
         depth,
         path,
         emission_path,
@@ -199,6 +203,7 @@ def integrate_rays(
     step_voxels,
     nearest,
     bounds,
+    estimate,
     depth,
     error,
     optical_depth,
@@ -228,12 +233,15 @@ def integrate_rays(
     bounds
         `bounds.Bounds`: what may be used in place of cells, and the error that this may make; None
         for a rule that certifies nothing.
+    estimate
+        True for an estimate of what the exact rule is off by; else None.
     depth
         (n,) float64, written: the expected distance to a hit, +inf where nothing can be hit; or
         None. A tint has no part in it.
     error
         (n,) float64, written with bounds: what transmittance (of any channel), and radiance as a
-        share of the brightest, is off by at most, but for rounding; else None.
+        share of the brightest, is off by at most, but for rounding; with ``estimate`` what radiance
+        is estimated to be off by; else None.
     optical_depth
         (n,) float64, written: without the tint.
     radiance
@@ -317,6 +325,7 @@ def integrate_rays(
                         tint,
                         nearest,
                         bounds,
+                        estimate,
                         depth,
                         path,
                         emission_path,
@@ -330,6 +339,8 @@ def integrate_rays(
             radiance[n, 2] = state.b
         if error is not None:
             error[n] = state.error
+            if estimate is not None and faded_out(state, tint):
+                error[n] += FADED * brightest_channel(state)
         if depth is not None:
             hit = -math.expm1(-state.tau)
             depth[n] = t_near + state.moment / hit if hit > 0.0 else math.inf

@@ -48,13 +48,15 @@ def exact_segment(
     tint,
     nearest,
     bounds,
+    estimate,
     depth,
     path,
     emission_path,
 ):
     """Walk a segment cell by cell; optical depth is exact in each. A constant is one cell.
 
-    With ``nearest`` a cell has one value. With ``bounds`` the error of its light is added up.
+    With ``nearest`` a cell has one value. With ``bounds`` the error of its light is added up,
+    with ``estimate`` an estimate of it.
     """
     x, y, z = corner
     i, j, k, tx, ty, tz, sx, sy, sz, ddx, ddy, ddz = start_all(ray, t0, x, y, z, 1.0, 8.0)
@@ -99,6 +101,7 @@ def exact_segment(
                     tint,
                     nearest,
                     bounds,
+                    estimate,
                     depth,
                     lit,
                     (own, cx + i, cy + j, cz + k),
@@ -136,6 +139,7 @@ def add_cell(
     tint,
     nearest,
     bounds,
+    estimate,
     depth,
     lit,
     own,
@@ -170,6 +174,7 @@ def add_cell(
                 tint,
                 nearest,
                 bounds,
+                estimate,
                 depth,
                 own,
                 path,

@@ -65,9 +65,3 @@ def strongest(tint):
 def weakest(tint):
     """The smallest factor of the extinction that any sum of the ray's uses."""
     return 1.0 if tint is None else min(1.0, min(tint[0], min(tint[1], tint[2])))
-
-
-@jit
-def reach(state, tint):
-    """The largest transmittance of any channel."""
-    return state.T if tint is None else math.exp(-weakest(tint) * state.tau)

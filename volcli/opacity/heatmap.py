@@ -24,6 +24,7 @@ LABELS = {
     "optical_depth": "optical depth",
     "depth": "depth along the camera's axis, world units",
     "error_bound": "certified error of transmittance and radiance",
+    "error_estimate": "estimated error of radiance",
 }
 
 _NOTHING = "0.8"  # the grey of pixels that have no value

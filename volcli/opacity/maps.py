@@ -32,8 +32,8 @@ MAP_HEADER = "volcli:map"
 SAME = 1e-6
 """A difference of opacity that is rounding."""
 
-ERRORS = ("error_bound",)
-"""The layers that say how far off a pixel may be."""
+ERRORS = ("error_bound", "error_estimate")
+"""The layers that say how far off a pixel may be, or is thought to be."""
 
 NO_ALPHA = "no alpha: opaque"
 """The source of opacity of an image that says nothing of it."""
