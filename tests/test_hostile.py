@@ -13,6 +13,7 @@ import pytest
 from commandline import SAMPLES, VOLUMES, volcli
 from vdbwriter import Grid, write_vdb
 
+from volcli import render
 from volcli.errors import VolumeError
 from volcli.grids import load_density, open_volume
 from volcli.grids.build import build
@@ -244,3 +245,14 @@ def test_the_peak_is_near_the_memory_that_explain_promised(volume, options, tmp_
     command = [sys.executable, "-c", "from volcli.cli import main; main()", *map(str, command)]
     told = json.loads(subprocess.run(command, capture_output=True, timeout=240).stdout)
     assert 0.8 < told["peak_memory_bytes"] / told["memory_bytes"] < 1.2
+
+
+@pytest.mark.parametrize("value", [-0.5, 1.5])
+def test_a_transmittance_that_is_no_probability_is_a_defect_and_never_a_picture(
+    value, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("volcli.render._mean", lambda v, mean=render._mean: mean(v) * 0 + value)
+    ran = volcli("render", SAMPLES / "rotated.vdb", "-o", tmp_path / "a.exr", "--size", "8x6")
+    assert ran.code == 1
+    assert "transmittance is a probability" in ran.err
+    assert list(tmp_path.iterdir()) == []

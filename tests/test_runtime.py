@@ -4,16 +4,20 @@ import json
 import os
 import random
 import resource
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
 import time
 
 import numba
+import numpy as np
 import pytest
 from commandline import SAMPLES, write_ball
 
-from volcli.images import read_exr
+from volcli.images import read_exr, write_exr
+from volcli.kernels import compiler
 
 SCRIPT = "from volcli.cli import main; main()"
 KILLS = int(os.environ.get("VOLCLI_KILLS", "8"))
@@ -62,6 +66,31 @@ def test_a_signal_ends_a_render_in_order_at_any_moment(tmp_path, number, seconds
         assert out.read_bytes() == b"old"
     else:
         read_exr(out)
+
+
+@pytest.mark.parametrize(
+    ("number", "command"),
+    [
+        (signal.SIGINT, "inspect {picture} --html {out}.html --heatmap {out}.png"),
+        (signal.SIGTERM, "compare {picture} {picture} --difference {out}.exr"),
+        (signal.SIGINT, "probe {cloud} --pixel 8,6 --csv {out}.csv --plot {out}.svg"),
+        (signal.SIGTERM, "info {cloud} --stats"),
+        (signal.SIGTERM, "render {cloud} -o {out}.exr --size 64x48 --cache {out}"),
+    ],
+    ids=lambda value: str(value).split()[0],
+)
+def test_a_signal_ends_the_other_commands_in_order_too(tmp_path, number, command):
+    picture, folder = tmp_path / "in.exr", tmp_path / "out"
+    write_exr(picture, dict.fromkeys("RGBA", np.full((48, 64), 0.5, np.float32)), {})
+    folder.mkdir()
+    places = {"picture": picture, "cloud": SAMPLES / "cloud.vdb", "out": folder / "a"}
+    running = start(*command.format(**places).split())
+    time.sleep(random.Random(command).uniform(0.4, 1.2))
+    running.send_signal(number)
+    code, _, err = ended(running)
+    assert code in (0, 128 + number), err
+    assert "Traceback" not in err
+    assert [p for p in folder.rglob("*") if p.name.startswith(".")] == []
 
 
 @pytest.mark.needs_jit
@@ -127,6 +156,19 @@ def test_streams_that_are_closed_are_no_error(tmp_path, closed):
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr + done.stdout
     read_exr(out)
+
+
+@pytest.mark.parametrize("arguments", ["info --stats --json", "probe --pixel 8,6 --json", "--help"])
+def test_a_reader_that_goes_away_is_no_error(arguments):
+    """As `| head -c 1` does."""
+    command, *options = arguments.split()
+    source = [] if command == "--help" else [SAMPLES / "rotated.vdb"]
+    running = start(command, *source, *options)
+    running.stdout.close()
+    err = running.stderr.read()
+    assert running.wait(timeout=120) == 0, err
+    assert "Traceback" not in err
+    assert "Broken" not in err
 
 
 @pytest.mark.parametrize("arguments", ["info --stats", "render --explain", "probe --pixel 8,6"])
@@ -204,6 +246,36 @@ def test_kernels_are_not_taken_from_a_folder_that_others_can_write_to(tmp_path):
     report, _ = render_json(tmp_path / "a.exr", **places)
     assert "kernels are compiled for each run" in report["warnings"][0]
     assert list(theirs.iterdir()) == []
+
+
+@pytest.mark.needs_jit
+def test_where_all_but_the_outputs_folder_is_read_only_there_is_one_warning(tmp_path):
+    """Site-packages, home and caches on a disk that is read-only."""
+    out = tmp_path / "out" / "a.exr"
+    kernels = tmp_path / "out" / f"volcli-kernels-{os.geteuid()}"
+    kernels.mkdir(mode=0o700, parents=True)
+    known = compiler._cache_folder()
+    shutil.copytree(known, kernels / known.name)  # or they would be compiled once more
+    script = "from volcli.cli import main; main()"
+    command = [sys.executable, "-c", script, "render", str(SAMPLES / "rotated.vdb"), "-o", str(out)]
+    inside = (
+        f"mount --bind {shlex.quote(str(out.parent))} {shlex.quote(str(out.parent))} && "
+        "mount -o remount,bind,ro / && exec " + shlex.join([*command, *SMALL, "--json"])
+    )
+    where = environment(NUMBA_CACHE_DIR=None, XDG_CACHE_HOME=None, HOME="/", TMPDIR=str(out.parent))
+    try:
+        done = subprocess.run(
+            ["unshare", "-m", "sh", "-c", inside], capture_output=True, text=True, env=where
+        )
+    except FileNotFoundError:
+        pytest.skip("there is no unshare here")
+    if "unshare" in done.stderr or "mount:" in done.stderr:
+        pytest.skip("only the superuser can make a disk read-only")
+    assert done.returncode == 0, done.stderr
+    (warning,) = json.loads(done.stdout)["warnings"]
+    assert "cannot be written; kernels are kept in" in warning
+    assert done.stderr.count("\n") == 1
+    read_exr(out)
 
 
 def test_without_a_home_a_picture_is_rendered(tmp_path):
