@@ -113,6 +113,9 @@ LENSES = [
     Ask("an eye that is its target", flags=("--target", "-9,0,0"), code=2, says="the same point"),
     Ask("a target 1e300 away", flags=("--target", "1e300,0,0"), tau=8.0),
     Ask("an eye 1e12 away", flags=("--eye", "-1e12,0,0"), tau=8.0),
+    Ask("an eye 1e14 away", flags=("--eye", "-1e14,0,0"), tau=8.0,
+        says="rays are placed to 0.02 voxels only"),
+    Ask("an eye 1e300 away", flags=("--eye", "-1e300,0,0"), says="nearer to the volume"),
 ]
 
 # One step over the whole of [-1, 8] samples its middle, where density is 1.

@@ -31,6 +31,9 @@ CENTRE = np.array([[0.5, 0.5]])
 _PARALLEL = 1e-9
 """The sine of the smallest angle between ``up`` and the view that still makes a frame."""
 
+_PLACED = 1e-3
+"""What places along rays may be off by, in voxels, before it is worth a warning."""
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -119,6 +122,24 @@ class Camera:
         latitude = math.pi * (0.5 - y / self.resolution[1])[:, :, None, None]
         level = np.cos(longitude) * self.forward + np.sin(longitude) * self.right
         return np.cos(latitude) * level + np.sin(latitude) * self.upward
+
+    def warnings(self, voxel_from_world: Floats) -> list[str]:
+        """What the user should know of a camera so far away that float64 has too few digits.
+
+        Parameters
+        ----------
+        voxel_from_world
+            (3, 4): of it and of the eye are the sums that are rounded.
+        """
+        matrix = np.abs(voxel_from_world)
+        sums = matrix[:, :3] @ np.abs(self.eye) + matrix[:, 3]
+        off = float(sums.max() * np.finfo(np.float64).eps)
+        if off <= _PLACED:
+            return []
+        return [
+            f"camera: rays are placed to {off:.1g} voxels only, as float64 holds them so far away; "
+            "bring the eye nearer to the volume, and both nearer to the world's origin"
+        ]
 
     def depth_per_distance(self, directions: Floats) -> Floats:
         """(n,): depth per unit of distance along each ray.

@@ -320,7 +320,9 @@ def render_loaded(
         "render": result.render_seconds,
     }
     rule = plan.rule if pilot is None else f"{prepared.plan.rule}: {plan.rule}"
-    warnings = (*plan.warnings, *loaded.warnings, *notes)
+    density = loaded.scene.density
+    far = [] if density.is_empty else camera.warnings(density.local_from_world)
+    warnings = (*plan.warnings, *loaded.warnings, *notes, *far)
     return Rendered(job, rule, pilot, result, seconds, warnings)
 
 
