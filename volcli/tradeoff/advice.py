@@ -15,7 +15,7 @@ from volcli.tradeoff.measure import Measured
 
 LEVEL = 0.1
 """Times that differ by less than this share of the shorter one are taken for the same, as are those
-within its spread: on another day either might be ahead."""
+below its upper quartile: in another run either might be ahead."""
 
 _FINE_STEP = 1.0
 _ROUNDING = 1e-6
@@ -70,7 +70,7 @@ def cheapest(measured: Sequence[Measured], target_error: float) -> Measured | No
     if not good:
         return None
     fastest = min(good, key=lambda m: m.median)
-    limit = max(max(fastest.seconds), fastest.median * (1 + LEVEL))
+    limit = max(float(np.quantile(fastest.seconds, 0.75)), fastest.median * (1 + LEVEL))
     return min((m for m in good if m.median <= limit), key=_by_error)
 
 
