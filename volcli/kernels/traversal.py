@@ -111,7 +111,11 @@ def straight(d):
     infinite, and 0 times that is NaN. Takes registers, too."""
     x, y, z = max(d[0], -d[0]), max(d[1], -d[1]), max(d[2], -d[2])
     least = max(x, max(y, z)) * LEADS_NOWHERE
-    return pick(x < least, 0.0, d[0]), pick(y < least, 0.0, d[1]), pick(z < least, 0.0, d[2])
+    return (
+        pick(x < least, 0.0 * d[0], d[0]),
+        pick(y < least, 0.0 * d[1], d[1]),
+        pick(z < least, 0.0 * d[2], d[2]),
+    )
 
 
 @jit
