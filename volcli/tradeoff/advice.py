@@ -1,6 +1,8 @@
 """What follows from measurements: the Pareto front, the order of convergence, the cheapest setting.
 
-Times are those of the whole picture, errors the largest of any pixel.
+Times are those of the whole picture, errors the largest of any pixel. What is shown and what a
+budget pays for are medians; which setting is the cheapest is judged by the quickest round of each:
+whatever else a machine does only ever adds to a time, so that another run finds the same.
 """
 
 from __future__ import annotations
@@ -14,8 +16,8 @@ from volcli.render import PIXEL_ERROR
 from volcli.tradeoff.measure import Measured
 
 LEVEL = 0.1
-"""Times that differ by less than this share of the shorter one are taken for the same, as are those
-below its upper quartile: in another run either might be ahead."""
+"""Times that differ by less than this share of the shorter one are taken for the same: in another
+run either might be ahead."""
 
 _FINE_STEP = 1.0
 _ROUNDING = 1e-6
@@ -69,9 +71,8 @@ def cheapest(measured: Sequence[Measured], target_error: float) -> Measured | No
     good = [m for m in measured if m.errors.largest <= target_error]
     if not good:
         return None
-    fastest = min(good, key=lambda m: m.median)
-    limit = max(float(np.quantile(fastest.seconds, 0.75)), fastest.median * (1 + LEVEL))
-    return min((m for m in good if m.median <= limit), key=_by_error)
+    limit = min(m.quickest for m in good) * (1 + LEVEL)
+    return min((m for m in good if m.quickest <= limit), key=_by_error)
 
 
 def advise(
@@ -89,4 +90,4 @@ def advise(
 
 def _by_error(one: Measured) -> tuple[float, float]:
     """Errors below rounding to float32 are the same; then the faster one is better."""
-    return max(one.errors.largest, PIXEL_ERROR), one.median
+    return max(one.errors.largest, PIXEL_ERROR), one.quickest

@@ -74,6 +74,11 @@ class Measured:
         """Of the rounds."""
         return statistics.median(self.seconds)
 
+    @property
+    def quickest(self) -> float:
+        """The shortest of the rounds."""
+        return min(self.seconds)
+
     def scaled(self, factor: float) -> Measured:
         """With the times of a picture of so many times the rays."""
         seconds = tuple(
