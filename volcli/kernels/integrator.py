@@ -48,6 +48,29 @@ class Traced(NamedTuple):
 Integrator = Callable[[NDArray[Any], NDArray[Any]], Traced]
 
 
+def _in_step(
+    density: Density,
+    colour: Source | None,
+    step_voxels: float | None,
+    bounds: Bounds | None,
+    tint: tuple[float, float, float] | None,
+) -> bool:
+    """Whether packets can see the colour, if there is one (`packet_light`): its bricks are those of
+    the density."""
+    if colour is None:
+        return True
+    return (
+        step_voxels is None
+        and bounds is None
+        and tint is None
+        and colour.table is None
+        and colour.scale > 0
+        and colour.same_lattice is not None
+        and not (colour.shift & 7).any()
+        and density.skip_background
+    )
+
+
 def make_integrator(
     density: Density,
     *,
@@ -79,18 +102,23 @@ def make_integrator(
     if not (colour or emission or bounds):
         tint = None  # then it is for the caller, as the constant colour is
 
-    if packets and transfer is None and colour is None and emission is None:
+    if (
+        packets
+        and transfer is None
+        and emission is None
+        and _in_step(density, colour, step_voxels, bounds, tint)
+    ):
         from volcli.kernels.packets import integrate_packets, packet_buffer
 
         def run(rays: Any, distance: Any, error: Any, tau: Any, light: Any, buffer: Any) -> int:
             if bounds is None:  # then nothing is off, by any estimate
                 error = None
             return integrate_packets(
-                *rays, density, *how, bounds, tint, distance, error, tau, *buffer
+                *rays, density, colour, *how, bounds, tint, distance, error, tau, light, *buffer
             )
 
         def make_buffer() -> Any:
-            return packet_buffer(bounds)
+            return packet_buffer(bounds, colour)
 
     else:
         from volcli.kernels.rays import integrate_rays

@@ -30,10 +30,10 @@ from volcli.kernels.packet_walk import Buffer, enter_cube, make_rays, nearest_pl
 from volcli.kernels.traversal import BRICK
 
 CORNER_ROW, STEP_ROW, FAR_ROW, SPEED_ROW, TAU_ROW, MOMENT_ROW, SLACK_ROW = 9, 12, 13, 14, 15, 16, 17
-RAY_ROWS = 18
+RED_ROW, RAY_ROWS = 18, 21
 """Numbers kept of each ray, a row of `LANES` for each: o, d and inverse come first (3 rows each),
 then the root cell's corner, the step of the midpoint rule, t_far, the planes crossed per world unit
-of distance, and the sums; the slack is what tau may be off by."""
+of distance, and the sums; the slack is what tau may be off by. Red is the first of three."""
 
 
 BINS = 32
@@ -239,13 +239,114 @@ def add_cells(sums, p, scale, t, t_exit, mask, depth, t_far):
     return Sums(pick(mask, sums.tau + whole, sums.tau), T, moment)
 
 
+class Cells(NamedTuple):
+    """Where segments stand in their bricks.
+
+    Attributes
+    ----------
+    at
+        INTS: where the cell is: low, its place in the brick; high, i, j and k, a byte each, whose
+        fourth bit is set as soon as one is not in 0 to 7.
+    corner
+        (x, y, z) FLOATS: the cell's lowest local voxel.
+    planes
+        (x, y, z) FLOATS: distances at which the next planes are crossed.
+    step, step_at, spacing
+        What is added to the three when a plane across x, y or z is crossed.
+    """
+
+    at: Any
+    corner: Any
+    planes: Any
+    step: Any
+    step_at: Any
+    spacing: Any
+
+
+@jit
+def enter_cells(rays, t, corner, width):
+    """The `Cells` of a brick with lowest local voxel ``corner`` in which rays are at distance t.
+
+    Where ``width`` is 8 and not 1, the whole brick is one cell.
+    """
+    walk = enter_cube(rays, t, corner, width, 8.0 / width)
+    i, j, k = to_ints(walk.cell[0]), to_ints(walk.cell[1]), to_ints(walk.cell[2])
+    return Cells(
+        (i << 32) + (j << 40) + (k << 48) + ((i * 9 + j) * 9 + k),
+        (
+            corner[0] + walk.cell[0] * width,
+            corner[1] + walk.cell[1] * width,
+            corner[2] + walk.cell[2] * width,
+        ),
+        walk.planes,
+        (walk.step[0] * width, walk.step[1] * width, walk.step[2] * width),
+        (
+            to_ints(walk.step[0] * width) * ((1 << 32) + 81),
+            to_ints(walk.step[1] * width) * ((1 << 40) + 9),
+            to_ints(walk.step[2] * width) * ((1 << 48) + 1),
+        ),
+        walk.spacing,
+    )
+
+
+@jit
+def cells_exit(cells, t1):
+    """Where the segments leave their cells, or end."""
+    return min(min(cells.planes[0], cells.planes[1]), min(cells.planes[2], t1))
+
+
+@jit
+def next_cells(cells):
+    """The cells beyond the nearest planes."""
+    over_x, over_y, over_z = nearest_plane(cells.planes)
+    x, y, z = cells.corner
+    tx, ty, tz = cells.planes
+    return Cells(
+        cells.at + pick(over_x, cells.step_at[0], pick(over_y, cells.step_at[1], cells.step_at[2])),
+        (
+            pick(over_x, x + cells.step[0], x),
+            pick(over_y, y + cells.step[1], y),
+            pick(over_z, z + cells.step[2], z),
+        ),
+        (
+            pick(over_x, tx + cells.spacing[0], tx),
+            pick(over_y, ty + cells.spacing[1], ty),
+            pick(over_z, tz + cells.spacing[2], tz),
+        ),
+        cells.step,
+        cells.step_at,
+        cells.spacing,
+    )
+
+
+@jit
+def in_brick(cells):
+    """Where a cell is one of its brick."""
+    return (cells.at & ((8 << 32) + (8 << 40) + (8 << 48))) == 0
+
+
+@jit
+def along(v, rays, cells, tm):
+    """`cell.cubic` of values v at the corners of cells, about distance tm."""
+    o, d = rays.o, rays.d
+    x, y, z = cells.corner
+    return cubic(
+        v,
+        o[0] + tm * d[0] - x,
+        o[1] + tm * d[1] - y,
+        o[2] + tm * d[2] - z,
+        d[0],
+        d[1],
+        d[2],
+    )
+
+
 @jit
 def exact_segments(grid, scale, nearest, depth, buffer, total):
     """The exact rule on the first ``total`` segments in sorted order; returns cells, INTS."""
     evaluated = ints(0)
     for first in range(0, total, LANES):
         seg = fetch(buffer, first, total)
-        o, d = seg.rays.o, seg.rays.d
         sums = Sums(floats(0.0), floats(1.0), floats(0.0))
         t, t1 = seg.begin, seg.end
         zero = floats(0.0)
@@ -259,47 +360,20 @@ def exact_segments(grid, scale, nearest, depth, buffer, total):
             evaluated = pick(constant, evaluated + 1, evaluated)
 
         active = seg.here & ~constant & (t < t1)
-        walk = enter_cube(seg.rays, t, seg.corner, 1.0, 8.0)
-        i, j, k = to_ints(walk.cell[0]), to_ints(walk.cell[1]), to_ints(walk.cell[2])
-        x, y, z = seg.corner
-        x, y, z = x + walk.cell[0], y + walk.cell[1], z + walk.cell[2]
-        # One number for where the cell is: low, its place in the brick; high, i, j and k, a byte
-        # each, whose fourth bit is set as soon as one is not in 0 to 7.
-        cell = (i << 32) + (j << 40) + (k << 48) + ((i * 9 + j) * 9 + k)
-        step_x = to_ints(walk.step[0]) * ((1 << 32) + 81)
-        step_y = to_ints(walk.step[1]) * ((1 << 40) + 9)
-        step_z = to_ints(walk.step[2]) * ((1 << 48) + 1)
-        outside = (8 << 32) + (8 << 40) + (8 << 48)
-        tx, ty, tz = walk.planes
+        cells = enter_cells(seg.rays, t, seg.corner, 1.0)
         while any_of(active):
-            t_exit = min(min(tx, ty), min(tz, t1))
-            at = seg.brick * 729 + (cell & 0xFFFF)
+            t_exit = cells_exit(cells, t1)
+            at = seg.brick * 729 + (cells.at & 0xFFFF)
             if nearest is not None:
                 p = (gather(grid.atlas, at, active), zero, zero, zero)
             else:
-                tm = 0.5 * (t + t_exit)
-                p = cubic(
-                    corners(grid.atlas, at, active),
-                    o[0] + tm * d[0] - x,
-                    o[1] + tm * d[1] - y,
-                    o[2] + tm * d[2] - z,
-                    d[0],
-                    d[1],
-                    d[2],
-                )
+                p = along(corners(grid.atlas, at, active), seg.rays, cells, 0.5 * (t + t_exit))
             met = active & (t_exit > t)
             sums = add_cells(sums, p, scale, t, t_exit, met, depth, seg.t_far)
             evaluated = pick(met, evaluated + 1, evaluated)
             t = max(t, t_exit)
-            over_x, over_y, over_z = nearest_plane((tx, ty, tz))
-            tx = pick(over_x, tx + walk.spacing[0], tx)
-            ty = pick(over_y, ty + walk.spacing[1], ty)
-            tz = pick(over_z, tz + walk.spacing[2], tz)
-            x = pick(over_x, x + walk.step[0], x)
-            y = pick(over_y, y + walk.step[1], y)
-            z = pick(over_z, z + walk.step[2], z)
-            cell = cell + pick(over_x, step_x, pick(over_y, step_y, step_z))
-            active = active & (t_exit < t1) & ((cell & outside) == 0)
+            cells = next_cells(cells)
+            active = active & (t_exit < t1) & in_brick(cells)
         scatter(buffer.tau, seg.place, sums.tau, seg.here)
         if depth is not None:
             scatter(buffer.moment, seg.place, sums.moment, seg.here)

@@ -18,10 +18,12 @@ from volcli.kernels.compiler import jit, kernel
 from volcli.kernels.lane_memory import gather, load, scatter, store
 from volcli.kernels.lanes import LANES, any_of, floats, ints, numbers, pick
 from volcli.kernels.packet_bounded import bounded_buffer, bounded_segments, error_of
+from volcli.kernels.packet_light import light_buffer, light_segments
 from volcli.kernels.packet_rules import (
     CORNER_ROW,
     FAR_ROW,
     MOMENT_ROW,
+    RED_ROW,
     SLACK_ROW,
     SPEED_ROW,
     STEP_ROW,
@@ -46,11 +48,15 @@ from volcli.kernels.packet_walk import (
 from volcli.kernels.traversal import straight
 
 
-def packet_buffer(bounds):
-    """Room for the work of one thread: (`packet_walk.Buffer`, `packet_bounded.BoundedBuffer` or
-    None), the latter with bounds alone."""
+def packet_buffer(bounds, colour):
+    """Room for the work of one thread: (`packet_walk.Buffer`, `packet_bounded.BoundedBuffer`,
+    `packet_light.LightBuffer`), None for what has no work."""
     buffer = make_buffer(ROOM)
-    return buffer, None if bounds is None else bounded_buffer(buffer)
+    return (
+        buffer,
+        None if bounds is None else bounded_buffer(buffer),
+        None if colour is None else light_buffer(),
+    )
 
 
 @jit
@@ -82,7 +88,20 @@ def to_local(m, vectors, row, mask, w):
 
 @jit
 def packet(
-    rays, t_far, alive, density, step, nearest, bounds, tint, depth, skip_background, buffer, more
+    rays,
+    t_far,
+    alive,
+    density,
+    colour,
+    step,
+    nearest,
+    bounds,
+    tint,
+    depth,
+    skip_background,
+    buffer,
+    more,
+    lit,
 ):
     """Integrate the rays of a packet, from where they enter the volume; returns cells, INTS.
 
@@ -100,6 +119,9 @@ def packet(
     keep(buffer, TAU_ROW, floats(0.0))
     keep(buffer, MOMENT_ROW, floats(0.0))
     keep(buffer, SLACK_ROW, floats(0.0))
+    if colour is not None:
+        zero = floats(0.0)
+        keep_vector(buffer, RED_ROW, (zero, zero, zero))
     at = enter(grid, rays, alive)
     t = floats(0.0)
     while any_of(alive):
@@ -123,6 +145,10 @@ def packet(
                     buffer,
                     more,
                     total,
+                )
+            elif colour is not None:
+                cells = light_segments(
+                    grid, colour, density.scale, nearest, depth, buffer, lit, total
                 )
             else:
                 sort_by_length(buffer, total)
@@ -151,6 +177,7 @@ def integrate_packets(
     origins,
     directions,
     density,
+    colour,
     step_voxels,
     nearest,
     bounds,
@@ -158,13 +185,15 @@ def integrate_packets(
     depth,
     error,
     optical_depth,
+    radiance,
     buffer,
     more,
+    lit,
 ):
     """Integrate a batch of rays; parameters and result are those of `rays.integrate_rays`, whose
     terms that are missing here are out.
 
-    ``buffer`` and ``more`` are a `packet_buffer`.
+    ``buffer``, ``more`` and ``lit`` are a `packet_buffer`.
     """
     skip_background = density.skip_background
     m, box = density.local_from_world, density.support
@@ -197,6 +226,7 @@ def integrate_packets(
                 t_far - t_near,
                 alive,
                 density,
+                colour,
                 step,
                 nearest,
                 bounds,
@@ -205,6 +235,7 @@ def integrate_packets(
                 skip_background,
                 buffer,
                 more,
+                lit,
             )
             tau = load(buffer.rays, TAU_ROW * LANES)
             if depth is not None:
@@ -214,6 +245,10 @@ def integrate_packets(
                 distance = pick(some, t_near + moment / pick(some, hit, 1.0), distance)
             if bounds is not None:
                 write_errors(buffer, tint, first, error)
+            if colour is not None:
+                scatter(radiance, row * 3, load(buffer.rays, RED_ROW * LANES), here)
+                scatter(radiance, row * 3 + 1, load(buffer.rays, (RED_ROW + 1) * LANES), here)
+                scatter(radiance, row * 3 + 2, load(buffer.rays, (RED_ROW + 2) * LANES), here)
         scatter(optical_depth, row, tau, here)
         if depth is not None:
             scatter(depth, row, distance, here)
