@@ -55,8 +55,10 @@ def _in_step(
     bounds: Bounds | None,
     tint: tuple[float, float, float] | None,
 ) -> bool:
-    """Whether packets can see the colour, if there is one (`packet_light`): its bricks are those of
-    the density."""
+    """Whether packets can see the colour, if there is one (`packet_light`).
+
+    (On one lattice its bricks are those of the density: grids begin at root cells.)
+    """
     if colour is None:
         return True
     return (
@@ -66,7 +68,6 @@ def _in_step(
         and colour.table is None
         and colour.scale > 0
         and colour.same_lattice is not None
-        and not (colour.shift & 7).any()
         and density.skip_background
     )
 
