@@ -53,6 +53,7 @@ def _in_step(
     colour: Source | None,
     step_voxels: float | None,
     bounds: Bounds | None,
+    estimate: bool,
     tint: tuple[float, float, float] | None,
 ) -> bool:
     """Whether packets can see the colour, if there is one (`packet_light`).
@@ -64,6 +65,7 @@ def _in_step(
     return (
         step_voxels is None
         and bounds is None
+        and not estimate
         and tint is None
         and colour.table is None
         and colour.scale > 0
@@ -107,7 +109,7 @@ def make_integrator(
         packets
         and transfer is None
         and emission is None
-        and _in_step(density, colour, step_voxels, bounds, tint)
+        and _in_step(density, colour, step_voxels, bounds, estimate, tint)
     ):
         from volcli.kernels.packets import integrate_packets, packet_buffer
 
