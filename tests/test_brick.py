@@ -221,19 +221,3 @@ def test_the_order_of_leaves_and_tiles_does_not_matter():
         shuffled |= {n: getattr(TILED, n)[order] for n in names}
     cells = cells_around([((120, 30, 30), (150, 80, 60))], 150)
     assert_same_field(replace(TILED, **shuffled), cells)
-
-
-def test_the_range_of_a_brick_bounds_the_field_in_all_of_its_cells():
-    tree = tree_of(scenes.random_values(7, (20, 9, 11)), (-3, 5, 4090))
-    grid = Medium(tree).grid
-    low, high = grid.brick_range
-    seen = set()
-    for offset in np.ndindex(21, 10, 12):
-        cell = np.array([-4, 4, 4089]) + offset
-        entry, _ = entry_at(grid, cell)
-        values = corners_of(grid, cell)
-        if entry >= 0:
-            seen.add(entry)
-            assert low[entry] <= values.min() <= values.max() <= high[entry]
-    assert seen == set(range(len(low)))
-    assert (low < high).all()

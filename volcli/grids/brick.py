@@ -115,11 +115,6 @@ class BrickGrid:
         return sum(array.nbytes for array in self.arrays)
 
     @cached_property
-    def brick_range(self) -> NDArray[np.float32]:
-        """(2, n) or (2, n, 3): the range of each brick, apron included, a bound of its field."""
-        return np.array([self.arrays.atlas.min(axis=1), self.arrays.atlas.max(axis=1)])
-
-    @cached_property
     def field_range(self) -> tuple[float, float]:
         """Smallest and largest value of the field, of any channel, the background included."""
         parts = (self.arrays.atlas, self.arrays.constants)
