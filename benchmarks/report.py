@@ -1,6 +1,6 @@
-"""Puts the results into the README: ``python -m benchmarks.report``.
+"""Puts the results into the README and docs/accuracy.md: ``python -m benchmarks.report``.
 
-Between ``<!-- NAME -->`` and ``<!-- /NAME -->`` the README holds what this module makes of
+Between ``<!-- NAME -->`` and ``<!-- /NAME -->`` a page holds what this module makes of
 ``results/NAME.json``, and nothing else.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from typing import Any
 
 from benchmarks.accuracy import STEPS
@@ -227,27 +228,105 @@ def _error(value: float | None) -> str:
     return "-" if value is None else f"{value:.0e}".replace("e-0", "e-")
 
 
+def calibrated(results: dict[str, Any]) -> str:
+    """What a target error keeps and buys."""
+    rows = [["", "target", "step", "pixels above, of 1000", "times less work", "with the pilot"]]
+    for name, targets in results["volumes"].items():
+        for target, row in targets.items():
+            step = row["pilot"]["step"]
+            with_pilot = row["times_faster_with_pilot"]
+            rows.append(
+                [
+                    name,
+                    f"{float(target):.2g}",
+                    "exact" if step is None else f"{step:g}",
+                    f"{1000 * row['pixels_above'] / row['pixels']:.2g}",
+                    "" if step is None else _ratio(row["times_faster"]),
+                    _ratio(with_pilot),
+                ]
+            )
+    rounds = next(iter(next(iter(results["volumes"].values())).values()))["times_faster"]["rounds"]
+    return (
+        f"{_markdown(rows)}\n\n800 x 600 rays with depth; work is the seconds of all processors, "
+        f"against `exact`'s, median (least to most) of\n{rounds} rounds."
+    )
+
+
+def certified(results: dict[str, Any]) -> str:
+    """What was allowed, what it came to, and what it took."""
+    scenes = {name: found for name, found in results.items() if name != "machine"}
+    rows = [["", "", *next(iter(scenes.values()))["certified"]]]
+    for name, found in scenes.items():
+        made = found["certified"].values()
+        colour = "colour varies" if found["colour_varies"] else "one colour"
+        rows += [
+            [name, "largest error", *(f"{row['error']:.1e}" for row in made)],
+            [colour, "largest certificate", *(f"{row['certificate']:.1e}" for row in made)],
+            [
+                "",
+                "evaluations, of exact's",
+                *(f"{row['evaluations_of_exact']:.2f}" for row in made),
+            ],
+            ["", "time, of exact's", *(f"{row['seconds_of_exact']['median']:.2f}" for row in made)],
+        ]
+    broken = sum(
+        row["violations"] for found in scenes.values() for row in found["certified"].values()
+    )
+    pixels = next(iter(scenes.values()))["pixels"]
+    count = len(rows[0]) - 2
+    return (
+        f"{_markdown(rows)}\n\nAllowed errors across; {pixels:,} pixels each. Pixels whose error "
+        f"is above their own certificate: {broken}, in all of the\n{count * len(scenes)} pictures "
+        "(`python -m benchmarks.certified`). A number after a name is the optical depth at the "
+        "thickest."
+    )
+
+
+def _ratio(found: dict[str, Any]) -> str:
+    return f"{found['median']:.1f} ({found['min']:.1f} to {found['max']:.1f})"
+
+
 def _markdown(rows: list[list[str]]) -> str:
     lines = ["| " + " | ".join(row) + " |" for row in rows]
     return "\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]])
 
 
-BLOCKS = (accuracy, peers, render, process, load, load_large, startup, scaling, memory, batch)
+BLOCKS = (
+    accuracy,
+    calibrated,
+    peers,
+    render,
+    process,
+    load,
+    load_large,
+    startup,
+    scaling,
+    memory,
+    batch,
+)
 """What the README has a place for; each is made of the results of its name."""
+
+PAGES = {README: BLOCKS, README.parent / "docs/accuracy.md": (certified,)}
+
+
+def block(make: Callable[[dict[str, Any]], str]) -> str:
+    """What a page has between its marks, and these."""
+    name = make.__name__
+    results = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+    return f"<!-- {name} -->\n{make(results)}\n<!-- /{name} -->"
 
 
 def main() -> None:
-    """Rewrite the README's results."""
-    text = README.read_text(encoding="utf-8")
-    for make in BLOCKS:
-        name = make.__name__
-        results = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
-        block = f"<!-- {name} -->\n{make(results)}\n<!-- /{name} -->"
-        text, count = re.subn(
-            rf"<!-- {name} -->.*?<!-- /{name} -->", lambda _, b=block: b, text, flags=re.DOTALL
-        )
-        assert count == 1, f"the README has no place for {name}"
-    README.write_text(text, encoding="utf-8")
+    """Rewrite the results in all pages."""
+    for page, makes in PAGES.items():
+        text = page.read_text(encoding="utf-8")
+        for make in makes:
+            name, made = make.__name__, block(make)
+            text, count = re.subn(
+                rf"<!-- {name} -->.*?<!-- /{name} -->", lambda _, b=made: b, text, flags=re.DOTALL
+            )
+            assert count == 1, f"{page.name} has no place for {name}"
+        page.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -137,10 +137,6 @@ def test_the_parts_of_a_start_add_up_to_it(tmp_path, monkeypatch):
     assert set(table["parts"]) == {"start", "load", "compile", "render", "write"}
 
 
-@pytest.mark.parametrize("make", report.BLOCKS)
-def test_the_readme_holds_what_the_results_say(make):
-    results = json.loads((common.RESULTS / f"{make.__name__}.json").read_text(encoding="utf-8"))
-    name = make.__name__
-    assert f"<!-- {name} -->\n{make(results)}\n<!-- /{name} -->" in report.README.read_text(
-        encoding="utf-8"
-    )
+@pytest.mark.parametrize("page, make", [(p, m) for p, ms in report.PAGES.items() for m in ms])
+def test_pages_hold_what_the_results_say(page, make):
+    assert report.block(make) in page.read_text(encoding="utf-8")
