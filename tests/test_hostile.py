@@ -256,3 +256,11 @@ def test_a_transmittance_that_is_no_probability_is_a_defect_and_never_a_picture(
     assert ran.code == 1
     assert "transmittance is a probability" in ran.err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_density_whose_optical_depth_is_beyond_all_numbers_is_described(tmp_path):
+    path = tmp_path / "a.npy"
+    np.save(path, np.full((9, 9, 9), 1e308))
+    ran = volcli("info", path, "--stats", "--json")
+    assert ran.code == 0, ran.err
+    assert json.loads(ran.out)["grids"][0]["optical_depth"] is None

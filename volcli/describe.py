@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -133,6 +134,8 @@ def _thickness(tree: Tree, header: GridHeader) -> dict[str, Any]:
     if not len(depths):
         return found
     least, median, most = (float(q) for q in np.percentile(depths, [25, 50, 99]))
+    if not math.isfinite(least + median + most):
+        return found
     found["optical_depth"] = {"25": least, "50": median, "99": most}
     if most < THIN or least > SOLID:
         looks = "empty" if most < THIN else "solid"

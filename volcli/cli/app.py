@@ -9,10 +9,14 @@ from typing import Any
 
 import typer
 
+from volcli.cli.table import in_short
 from volcli.errors import VolcliError
 
 _ParserError: Any = typer.BadParameter.__mro__[2]
 """What the parser of the command line raises; typer has it under no name of its own."""
+
+_LONGEST = 1000
+"""Letters of an error, which may quote what a file holds."""
 
 COMMANDS = {
     "render": "Render a picture of a volume.",
@@ -108,7 +112,12 @@ def run_app(arguments: Sequence[str]) -> int:
 
 
 def _fail(message: str, code: int) -> int:
-    print(f"volcli: {' '.join(message.split())}", file=sys.stderr)
+    """Say what went wrong in one line that does not fill the screen, with nothing that a terminal
+    would obey.
+    """
+    message = " ".join(message.split())
+    shown = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in message)
+    print(f"volcli: {in_short(shown, _LONGEST)}", file=sys.stderr)
     return code
 
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from volcli.errors import VolumeError
 from volcli.grids.census import Census, census_of
-from volcli.grids.tree import LEAF_WIDTH, GridHeader, Progress, Tree
+from volcli.grids.tree import LEAF_WIDTH, GridHeader, Progress, Tree, unique_labels
 from volcli.memory import no_room, reserve
 
 _PLACEMENT = ("voxel_size", "origin")
@@ -127,8 +127,13 @@ def open_dense(path: Path) -> DenseVolume:
         raise VolumeError(f"{path}: not a readable NumPy file: {_reason(error)}") from error
     if not shapes:
         raise VolumeError(f"{path}: holds no array")
+    labels = unique_labels(list(shapes))
     return DenseVolume(
-        path, tuple(_header(n, *described, world) for n, described in shapes.items())
+        path,
+        tuple(
+            _header(name, label, *described, world)
+            for label, (name, described) in zip(labels, shapes.items(), strict=True)
+        ),
     )
 
 
@@ -270,6 +275,7 @@ def _not_a_place(path: Path, reason: str) -> VolumeError:
 
 def _header(
     name: str,
+    label: str,
     shape: tuple[int, ...],
     dtype: np.dtype[Any],
     file_bytes: int,
@@ -286,7 +292,7 @@ def _header(
     ends = tuple(n - 1 for n in shape[:3])
     return GridHeader(
         name=name,
-        label=name,
+        label=label,
         value_type="vec3" + dtype.name if vector else dtype.name,
         grid_class="fog volume" if not vector else "unknown",
         map_type="ScaleTranslateMap",

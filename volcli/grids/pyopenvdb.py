@@ -30,8 +30,8 @@ import numpy as np
 
 from volcli.errors import VolumeError
 from volcli.grids.census import Census
-from volcli.grids.tree import GridHeader, Progress, Tree
-from volcli.grids.vdb import declared_box, declared_count, open_vdb, unique_labels
+from volcli.grids.tree import GridHeader, Progress, Tree, unique_labels
+from volcli.grids.vdb import declared_box, declared_count, open_vdb
 from volcli.memory import memory_left
 
 INTERPRETER_VARIABLE = "VOLCLI_OPENVDB_PYTHON"

@@ -6,7 +6,8 @@ the form that the kernels walk. Nothing here knows a file format.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,6 +22,8 @@ Progress = Callable[[int, int], None]
 
 LEAF_WIDTH = 8
 """Voxels along an edge of a leaf."""
+
+_LONGEST = 200  # characters of a name that are shown
 
 
 @dataclass(frozen=True)
@@ -108,6 +111,27 @@ class Tree:
     tile_widths: NDArray[np.int32]
     tile_values: NDArray[Any]
     tile_active: NDArray[np.bool_]
+
+
+def unique_labels(names: Sequence[str]) -> list[str]:
+    """Label grids: a unique name as it is, others with their number among those of one name."""
+    shown = [_shown(name) for name in names]
+    taken = {name for name, uses in Counter(shown).items() if name and uses == 1}
+    number: Counter[str] = Counter()
+    labels = []
+    for name in shown:
+        label = name
+        if name not in taken:
+            while (label := f"{name}[{number[name]}]") in taken:
+                number[name] += 1
+            number[name] += 1
+        labels.append(label)
+    return labels
+
+
+def _shown(name: str) -> str:
+    """A name fit for a terminal and for one line: nothing that a terminal would obey."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name[:_LONGEST])
 
 
 class Volume(Protocol):

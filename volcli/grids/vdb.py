@@ -16,8 +16,7 @@ from __future__ import annotations
 
 import mmap
 import re
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,7 +27,7 @@ import numpy as np
 
 from volcli.errors import VolumeError
 from volcli.grids.census import Census
-from volcli.grids.tree import GridHeader, Progress, Tree
+from volcli.grids.tree import GridHeader, Progress, Tree, unique_labels
 from volcli.grids.vdb_codec import (
     HAS_BLOCK_MODE,
     VALUE_TYPES,
@@ -53,7 +52,6 @@ _HALF_SUFFIX = "_HalfFloat"
 _DUPLICATE = "\x1e"  # before the number that sets apart grids of one name
 _TYPE = re.compile(r"Tree_(\w+?)_(\d+(?:_\d+)*)")
 _CONFIGURATION = "5_4_3"
-_LONGEST = 200  # characters of a name that are shown
 
 _METADATA_LAYOUTS = {
     name: Struct("<" + code)
@@ -354,28 +352,8 @@ def _end_of_stream(grid: _Grid, behind: int) -> _Grid:
     return replace(grid, header=replace(grid.header, refusal=lost))
 
 
-def unique_labels(names: Sequence[str]) -> list[str]:
-    """Label grids: a unique name as it is, others with their number among those of one name."""
-    taken = {name for name, uses in Counter(names).items() if name and uses == 1}
-    number: Counter[str] = Counter()
-    labels = []
-    for name in names:
-        label = name
-        if name not in taken:
-            while (label := f"{name}[{number[name]}]") in taken:
-                number[name] += 1
-            number[name] += 1
-        labels.append(label)
-    return labels
-
-
-def _shown(name: str) -> str:
-    """A name fit for a terminal and for one line: nothing that a terminal would obey."""
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name[:_LONGEST])
-
-
 def _labelled(grids: list[_Grid]) -> list[_Grid]:
-    labels = unique_labels([_shown(grid.header.name) for grid in grids])
+    labels = unique_labels([grid.header.name for grid in grids])
     return [
         replace(grid, header=replace(grid.header, label=label))
         for grid, label in zip(grids, labels, strict=True)

@@ -34,8 +34,8 @@ def open_image(path: Path) -> "oiio.ImageInput":
     if source is None:
         raise Failed(error_of(oiio) or "no reason given")
     try:
-        _ = source.spec().channelnames
-    except UnicodeDecodeError as error:
+        "".join(source.spec().channelnames).encode()  # what is no text comes as half of a letter
+    except UnicodeError as error:
         source.close()
         raise Failed("the names of its channels are no text") from error
     return source

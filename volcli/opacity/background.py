@@ -6,6 +6,7 @@ from the old background can be taken away again.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -136,11 +137,17 @@ def _rendered_background(maps: Maps) -> Floats | None:
     """(4,) or (h, w, 4): what the picture was rendered over; None: nothing."""
     wanted = maps.job.get("background", {})
     if "color" in wanted:
-        return np.array([*wanted["color"], 1.0], np.float32)
+        with suppress(TypeError, ValueError, OverflowError):  # the header may hold anything
+            color = np.array([*wanted["color"], 1.0], np.float32)
+            if color.shape == (4,) and np.isfinite(color).all():
+                return color
+        raise UsageError(
+            f"{maps.stored.path}: the job in its header is damaged: background.color is no colour"
+        )
     if "image" not in wanted:
         return None
     try:
-        return read_background(Path(wanted["image"]), maps.stored.size)
+        return read_background(Path(str(wanted["image"])), maps.stored.size)
     except UsageError as error:
         raise UsageError(
             f"{maps.stored.path}: was rendered over {wanted['image']}, which is needed to take "

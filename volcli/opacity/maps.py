@@ -9,6 +9,7 @@ other. Under a tint each layer has three channels; the maps are the means over t
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -83,15 +84,16 @@ class Maps:
         """The tables of the job that the header holds; empty where it holds none."""
         text = self.stored.attributes.get(JOB_HEADER)
         try:
-            return parse_toml(str(text)) if text else {}
+            tables = parse_toml(str(text)) if text else {}
         except ValueError:
             return {}
+        return {name: table for name, table in tables.items() if isinstance(table, dict)}
 
     @property
     def rule(self) -> str | None:
         """The rule of integration by which volcli made the image, if it says so."""
         rule = self.stored.attributes.get("volcli:rule")
-        return None if rule is None else str(rule)
+        return None if rule is None else "".join(c for c in str(rule) if c.isprintable())
 
     @property
     def is_mean(self) -> bool:
@@ -104,7 +106,11 @@ class Maps:
     def density_scale(self) -> float | None:
         """The density scale that the image was rendered with, if it says so."""
         scale = self.job.get("density", {}).get("scale")
-        return float(scale) if isinstance(scale, int | float) else None
+        try:
+            known = isinstance(scale, int | float) and math.isfinite(scale)
+        except OverflowError:  # a whole number beyond all
+            return None
+        return float(scale) if known else None
 
 
 def read_maps(path: str | os.PathLike[str]) -> Maps:
