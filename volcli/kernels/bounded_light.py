@@ -34,6 +34,13 @@ by nothing for odd k or k < 8: in sum by less than 4.07 M rho^-8 / (1 - rho^-2).
 Any rho will do; two are tried. Emission e, a cubic as well, is multiplied by exp(-a) alone:
 e (1 - a) is of degree 7, and e (exp(-a) - 1 + a) is what is wrong.
 
+**What is thin** needs no nodes. With the mean k = O / t of exp(-a) over the part's depth t, O being
+its opacity, the part's radiance is taken as k times the integral of c s, a polynomial: that is O
+times the mean colour, weighted with density. What that is off by is the integral of
+(c - m) (exp(-a) - k) over depth, at most r times that of |exp(-a) - k|, which is at most r t^2 / 3:
+a function that falls by less than its argument grows differs from its mean, on average over [0, t],
+by no more than two points of [0, t] do from each other. Emission is left to the nodes.
+
 **What always holds** is that both the rule and the truth lie between the least and the largest
 colour of the part: they differ by at most 2 r D. So the bound of ever smaller parts goes to 0.
 
@@ -83,6 +90,8 @@ SMALL, LARGE = _ellipse(4.0), _ellipse(16.0)
 SHORTEST = 2.0**-40
 """A part of a span is no shorter than this share of it, whatever its error: that is below 2^-39 of
 what is seen of it."""
+
+TWO_THIRDS, TWO_SEVENTHS = 2.0 / 3.0, 2.0 / 7.0
 
 NOTHING = (0.0, 0.0, 0.0, 0.0)
 """A cubic that is 0."""
@@ -289,9 +298,17 @@ def add_bounded_span(
         tau, T, r, g, b, moment, t_far, error = state
         middle, half = 0.5 * (u + to), 0.5 * (to - u)
         lit = curves(colour, colour_at[0], colours, middle, half)
+        s = scaled(shifted(p, middle, half), scale)
+        if emission is None:
+            part = max(0.0, scale * (antiderivative(p, to) - antiderivative(p, u)))
+            thin = error + share(thin_error(state, part, lit, tint), bounds)
+            if thin <= bounds.max_error * (tm + to) / t_far:
+                state = add_thin(state, thin, s, tm + middle, half, part, lit, tint)
+                u = to
+                length *= 2.0
+                continue
         glow = curves(emission, emission_at[0], glows, middle, half)
         part, at, w = hit_weights(p, scale, u, to)
-        s = scaled(shifted(p, middle, half), scale)
         error += share(largest_error(state, s, half, part, lit, glow, tint), bounds)
         if error > bounds.max_error * (tm + to) / t_far and length > shortest:
             length *= 0.5
@@ -309,6 +326,52 @@ def add_bounded_span(
         length *= 2.0
     _, T, r, g, b, moment, t_far, error = state
     return State(final, T, r, g, b, moment, t_far, error)
+
+
+@jit
+def thin_error(state, part, lit, tint):
+    """What `add_thin` is off by at most in a part of that optical depth, in any channel."""
+    r = swing(magnitudes(lit[0], lit[1], lit[2]))
+    if tint is None:
+        return state.T * channel_thin(part, r, lit[3])
+    return max(
+        math.exp(-tint[0] * state.tau) * channel_thin(tint[0] * part, r, lit[3]),
+        max(
+            math.exp(-tint[1] * state.tau) * channel_thin(tint[1] * part, r, lit[3]),
+            math.exp(-tint[2] * state.tau) * channel_thin(tint[2] * part, r, lit[3]),
+        ),
+    )
+
+
+@jit
+def channel_thin(part, r, residual):
+    """`thin_error` of a channel, if all light reaches the part."""
+    return r * part * part * THIRD + residual * absorbed(part)
+
+
+@jit
+def add_thin(state, error, s, t, half, part, lit, tint):
+    """The state after a part about the distance t, all of the colour that is its mean, weighted
+    with its extinction ``s``."""
+    tau, T, r, g, b, moment, t_far, _ = state
+    # The integrals of x s, x^2 s and x^3 s over [-1, 1], as shares of that of s.
+    whole = half / part if part > 0.0 else 0.0
+    x1 = whole * (TWO_THIRDS * s[1] + 0.4 * s[3])
+    x2 = whole * (TWO_THIRDS * s[0] + 0.4 * s[2])
+    x3 = whole * (0.4 * s[1] + TWO_SEVENTHS * s[3])
+    hit = T * absorbed(part)
+    if tint is None:
+        hr = hg = hb = hit
+    else:
+        hr = math.exp(-tint[0] * tau) * absorbed(tint[0] * part)
+        hg = math.exp(-tint[1] * tau) * absorbed(tint[1] * part)
+        hb = math.exp(-tint[2] * tau) * absorbed(tint[2] * part)
+    red, green, blue, _ = lit
+    r += hr * (red[0] + x1 * red[1] + x2 * red[2] + x3 * red[3])
+    g += hg * (green[0] + x1 * green[1] + x2 * green[2] + x3 * green[3])
+    b += hb * (blue[0] + x1 * blue[1] + x2 * blue[2] + x3 * blue[3])
+    moment += hit * (t + half * x1)
+    return State(tau + part, T - hit, r, g, b, moment, t_far, error)
 
 
 @jit
