@@ -71,14 +71,17 @@ class Camera:
     samples: Floats
 
     def rays(
-        self, rows: slice, columns: slice | NDArray[np.int64], samples: Floats = CENTRE
+        self,
+        rows: slice | NDArray[np.int64],
+        columns: slice | NDArray[np.int64],
+        samples: Floats = CENTRE,
     ) -> tuple[Floats, Floats]:
         """Origins and unit directions of pixels, sample by sample, row by row.
 
         Parameters
         ----------
         rows, columns
-            Of the picture; of columns also their numbers.
+            Of the picture, or their numbers.
         samples
             (n, 2): where in each pixel, as parts of its width and height; by default its centre.
 

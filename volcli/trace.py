@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,17 +41,6 @@ class RayResult:
     radiance: Floats
     error_bound: Floats | None
     evaluations: int
-
-    def of(self, rays: NDArray[np.int64]) -> RayResult:
-        """Those of some of the rays."""
-        bound = None if self.error_bound is None else self.error_bound[rays]
-        return replace(
-            self,
-            optical_depth=self.optical_depth[rays],
-            transmittance=self.transmittance[rays],
-            radiance=self.radiance[rays],
-            error_bound=bound,
-        )
 
 
 def trace(
