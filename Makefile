@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SETUP := $(VENV)/.installed
 
-.PHONY: demo test lint bench gallery gallery-elsewhere samples clean
+.PHONY: demo test lint bench gallery gallery-elsewhere gallery-opacity gallery-tradeoff samples clean
 
 demo: $(SETUP)
 	mkdir -p out
@@ -16,7 +16,8 @@ test: $(SETUP) lint
 	$(BIN)/python -m pytest -n 2
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -n 2 -q -r f \
 	    tests/test_kernels_cell.py tests/test_brick.py tests/test_render.py tests/test_render_extremes.py \
-	    tests/test_emission.py tests/test_tint.py tests/test_crossing.py tests/test_plan.py
+	    tests/test_emission.py tests/test_tint.py tests/test_crossing.py tests/test_plan.py \
+	    tests/test_calibrate.py tests/test_tradeoff.py
 
 lint: $(SETUP)
 	$(BIN)/ruff check .
@@ -43,6 +44,7 @@ bench: $(SETUP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
 	$(BIN)/python -m benchmarks.accuracy
 	$(BIN)/python -m pytest benchmarks/test_parts.py -q --benchmark-json benchmarks/results/parts.json
+	$(BIN)/python -m benchmarks.calibrated
 	$(BIN)/python -m benchmarks.startup
 	$(BIN)/python -m benchmarks.inspect
 	$(BIN)/python -m benchmarks.load
@@ -86,6 +88,11 @@ gallery-opacity: $(SETUP)
 	$(BIN)/volcli probe samples/explosion.vdb --density-scale 2 --color-grid Cd --pixel 400,300 \
 	    --step 2 --step 8 --plot docs/probe.png
 	$(BIN)/python docs/strip_headers.py docs/page.png docs/heatmap.png docs/probe.png
+
+# The README's picture of speed against accuracy: on an idle machine, since times are what it shows.
+gallery-tradeoff: $(SETUP)
+	$(BIN)/volcli tradeoff configs/certified.toml -o out/tradeoff --size 640x360 --target-error 0.0039
+	cp out/tradeoff/tradeoff.png docs/tradeoff.png
 
 # Needs the real OpenVDB library (Debian: apt-get install python3-openvdb).
 samples:
