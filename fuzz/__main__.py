@@ -28,13 +28,14 @@ def main() -> int:
         print(f"{asked.write}: {made.seed.name}, damaged")
         return 0
     numbers = range(asked.first, asked.first + asked.cases)
-    told = {"findings": 0}
+    told = 0
     with tqdm(total=asked.cases, unit=" files", file=sys.stderr, mininterval=1.0) as bar:
 
         def progress(tally: Tally) -> None:
-            for finding in tally.findings[told["findings"] :]:
+            nonlocal told
+            for finding in tally.findings[told:]:
                 bar.write(f"case {finding.number}: {finding.what}\n")
-            told["findings"] = len(tally.findings)
+            told = len(tally.findings)
             bar.set_postfix(findings=len(tally.findings), refresh=False)
             bar.update(tally.cases - bar.n)
 
