@@ -99,6 +99,8 @@ def scene_of(terms):
     elsewhere = affine(0.7 * np.eye(3), (1.0, 0.5, 0.25))
     colours = medium(random_colours(9, (9, 8, 10)), world_from_index=elsewhere)
     if terms == "a colour grid":
+        return Scene(density.grid, 0.5, Source(medium(random_colours(9, (9, 8, 10))).grid))
+    if terms == "a colour grid elsewhere":
         return Scene(density.grid, 0.5, Source(colours.grid))
     by_value = ColorTable(np.array([0.0, 0.5, 1.0]), np.eye(3))
     return Scene(
@@ -166,7 +168,7 @@ def test_a_picture_is_the_same_to_the_bit_for_any_threads_and_tiles(rule, ways, 
 
 
 @pytest.mark.needs_jit
-@pytest.mark.parametrize("terms", ["a colour grid", "all that there is"])
+@pytest.mark.parametrize("terms", ["a colour grid", "a colour grid elsewhere", "all that there is"])
 @pytest.mark.parametrize("rule", RULES)
 def test_so_it_is_whatever_shines(rule, terms, monkeypatch):
     scene, plan = prepared(terms, rule)
