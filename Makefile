@@ -17,7 +17,8 @@ test: $(SETUP) lint
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -n 2 -q -r f \
 	    tests/test_kernels_cell.py tests/test_brick.py tests/test_render.py tests/test_render_extremes.py \
 	    tests/test_emission.py tests/test_tint.py tests/test_crossing.py tests/test_plan.py \
-	    tests/test_calibrate.py tests/test_tradeoff.py tests/test_extremes.py tests/test_properties.py
+	    tests/test_calibrate.py tests/test_tradeoff.py tests/test_extremes.py tests/test_properties.py \
+	    tests/test_bounded_grids.py tests/test_bounded_rays.py
 
 lint: $(SETUP)
 	$(BIN)/ruff check .
