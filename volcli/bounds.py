@@ -239,7 +239,8 @@ def _by_parts(work: Callable[[slice], None], bricks: int) -> None:
 
 def _outwards(ranges: Floats) -> NDArray[np.float32]:
     """(n, 9, 2, c) to float32: what was least no larger, what was largest no smaller."""
-    rounded = ranges.astype(np.float32)
+    with np.errstate(over="ignore"):  # beyond float32 it is Inf, which bounds as well
+        rounded = ranges.astype(np.float32)
     low, high = rounded[:, :, 0], rounded[:, :, 1]
     down = np.nextafter(low, np.float32(-np.inf), where=low > ranges[:, :, 0], out=low.copy())
     up = np.nextafter(high, np.float32(np.inf), where=high < ranges[:, :, 1], out=high.copy())
