@@ -13,8 +13,8 @@ demo: $(SETUP)
 
 # The second run has the kernels as plain Python, so that nothing rests on a quirk of the compiler.
 test: $(SETUP) lint
-	$(BIN)/python -m pytest -n 2
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -n 2 -q -r f \
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -n 2 --dist loadfile -q -r f \
 	    tests/test_kernels_cell.py tests/test_brick.py tests/test_render.py tests/test_render_extremes.py \
 	    tests/test_emission.py tests/test_tint.py tests/test_crossing.py tests/test_plan.py \
 	    tests/test_calibrate.py tests/test_tradeoff.py tests/test_extremes.py tests/test_properties.py \
