@@ -357,8 +357,12 @@ def test_a_reader_that_goes_away_is_no_error(folder):
 def test_an_interrupt_ends_at_once_with_130_and_leaves_nothing(folder, after_seconds):
     arguments = ["render", "ball.npz", "-o", "a.exr", "--size", "9000x9000"]
     process = subprocess.Popen(
-        [*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+        [*COMMAND, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # a shell has what it starts in the background ignore interrupts
     time.sleep(after_seconds)
     process.send_signal(signal.SIGINT)
     asked = time.monotonic()

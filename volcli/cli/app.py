@@ -24,7 +24,7 @@ COMMANDS = {
     "info": "List the grids of a volume.",
     "inspect": "Look at the opacity of images.",
     "probe": "Follow rays through a scene.",
-    "tradeoff": "Measure speed against accuracy.",
+    "tradeoff": "Measure speed against accuracy on a picture of one's own.",
     "compare": "Compare two images, channel by channel.",
     "recomposite": "Put another background behind a rendered picture.",
 }
