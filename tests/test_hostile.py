@@ -1,6 +1,7 @@
 """Files that are made to do harm: refused by name, at the byte, before anything is allocated."""
 
 import json
+import os
 import re
 import struct
 import subprocess
