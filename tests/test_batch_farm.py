@@ -12,7 +12,7 @@ import pytest
 from batches import count, events, start, wait_until, write_batch, write_many
 from commandline import ROOT, SAMPLES, volcli, write_ball
 
-from volcli.batch.farm import Farm
+from volcli.batch.farm import Farm, _cluster
 from volcli.batch.work import Limits, Task
 from volcli.config import load_job
 from volcli.images import read_exr
@@ -219,3 +219,11 @@ def test_where_no_scheduler_answers_is_told_in_a_line(tmp_path, monkeypatch):
     ran = volcli("batch", batch, "--scheduler", "tcp://127.0.0.1:9", "--resume")
     assert ran.code == 2
     assert "pip install 'volcli[farm]'" in ran.err
+
+
+def test_workers_take_no_profiles_for_which_an_interpreter_can_stand_still():
+    from distributed import Client
+
+    with _cluster(1, Limits()) as cluster, Client(cluster) as client:
+        (regular,) = client.run(lambda dask_worker: list(dask_worker.periodic_callbacks)).values()
+    assert "heartbeat" in regular and not any("profile" in name for name in regular)

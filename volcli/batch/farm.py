@@ -201,6 +201,9 @@ def _cluster(count: int, limits: Limits) -> Any:
         "distributed.worker.memory.target": False,
         "distributed.worker.memory.spill": False,
         "distributed.worker.memory.pause": False,
+        # A profile looks at the stacks of all threads, a hundred times a second; where one begins
+        # meanwhile some interpreters (CPython 3.11) stand still for ever.
+        "distributed.worker.profile.enabled": False,
     }
     with dask.config.set(settings):
         return LocalCluster(
