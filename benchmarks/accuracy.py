@@ -75,7 +75,7 @@ def compare(path: Path, rays: int = RAYS, steps: Sequence[float] = STEPS) -> dic
 
 def _variant(plan: Plan, step: float | None) -> Plan:
     """The plan with depth, to the end of every ray, by the rule that is asked for."""
-    return replace(plan, depth=True, step_voxels=step)
+    return replace(plan, depth=True, step_voxels=step, max_error=None)
 
 
 def lattice_of(tree: Any, grid: BrickGrid) -> Any:
