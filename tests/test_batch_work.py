@@ -290,7 +290,7 @@ class Scripted:
         pass
 
 
-REPORT = run.Report(None, {}, (1, 1), "exact", 1, 1, {}, {}, None, None, {}, 0, [])
+REPORT = run.Report(None, {}, (1, 1), "exact", 1, 1, {}, {}, None, None, None, {}, 0, [])
 
 
 def played(ball, tmp_path, script, retries=1, room=2):
