@@ -18,7 +18,7 @@ test: $(SETUP) lint
 	    tests/test_kernels_cell.py tests/test_brick.py tests/test_render.py tests/test_render_extremes.py \
 	    tests/test_emission.py tests/test_tint.py tests/test_crossing.py tests/test_plan.py \
 	    tests/test_calibrate.py tests/test_tradeoff.py tests/test_extremes.py tests/test_properties.py \
-	    tests/test_bounded_grids.py tests/test_bounded_rays.py
+	    tests/test_bounded_grids.py tests/test_bounded_rays.py tests/test_estimate_of_error.py
 
 lint: $(SETUP)
 	$(BIN)/ruff check .

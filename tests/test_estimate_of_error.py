@@ -88,6 +88,10 @@ ROUGHLY = {
 
 @pytest.mark.parametrize("name", ROUGHLY)
 def test_an_estimate_is_seldom_below_the_error(name, monkeypatch):
+    if bounded.COMPILED and name == "emission on another lattice":
+        pytest.skip("another kernel to compile; runs uncompiled")
+    if not bounded.COMPILED and name == "a tint that lets green pass":
+        pytest.skip("too few rays, uncompiled, to see an error in")
     rays, below, ratios = bounded.rays_of(bounded.VIEW), [], []
     for scale in (0.1, 1.0, 10.0):
         scene = bounded.scene_of(bounded.SCENES[name], scale)
